@@ -1,0 +1,44 @@
+# `make demo` and `make test` set up what they need the first time and are quick afterwards.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+BENCH  := $(VENV)/.bench-ready
+
+.PHONY: demo test lint bench clean help
+
+help:            ## this list
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 16
+
+$(READY): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "Python 3.11 or newer is needed; name it with: make PYTHON=python3.12 …" >&2; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(BIN)/python -m scanner.kernels
+	@touch $@
+
+demo: $(READY)   ## scan the mirror scene on the simulated bench and compare MFS with TPS
+	$(BIN)/scan --config configs/demo.yaml --out demo-result --overwrite
+	$(BIN)/scan compare --config configs/demo.yaml --methods mfs,tps --reuse demo-result --out demo-comparison --overwrite
+
+test: lint       ## lint, types, arrows and every test
+	$(BIN)/python -m pytest
+
+lint: $(READY)   ## style, types, and who may import whom
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+# The peer package brings a second OpenCV of its own: it is installed without its dependencies.
+$(BENCH): $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check scikit-image sympy pyyaml
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'Fringes>=2.1'
+	@touch $@
+
+bench: $(BENCH)  ## speed, as ratios to a peer and to reading the frames once
+	$(BIN)/python -m pytest tests/benchmarks -m bench -s -o addopts="--import-mode=importlib -p no:cacheprovider"
+
+clean:           ## forget the environment and the demo's output
+	rm -rf $(VENV) demo-result demo-comparison

@@ -1,0 +1,1 @@
+"""What a scan is: patterns, mathematics, the two rounds, the recording, the results."""

@@ -1,0 +1,1 @@
+"""A bench that is not there: scenes, light transport, simulated devices, faults."""
