@@ -38,7 +38,7 @@ $(BENCH): $(READY)
 	@touch $@
 
 bench: $(BENCH)  ## speed, as ratios to a peer and to reading the frames once
-	$(BIN)/python -m pytest tests/benchmarks -m bench -s -o addopts="--import-mode=importlib -p no:cacheprovider"
+	$(BIN)/python -m pytest tests/benchmarks -m bench -s
 
 clean:           ## forget the environment and the demo's output
 	rm -rf $(VENV) demo-result demo-comparison

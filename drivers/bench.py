@@ -1,7 +1,7 @@
 """A bench: devices that work together, and the one thing a scan asks of them: "this pattern, exposed".
 
 A *bench kind* is what the entry-point group ``scanner.benches`` names: an object with a pydantic model of its settings
-and an ``open(settings)`` context manager that gives a `Bench`. `SteppedBench` composes any camera and projector into one.
+and an ``open(settings)`` context manager that gives a `Bench`. `SteppedBench` makes one of any camera and projector.
 """
 
 from __future__ import annotations

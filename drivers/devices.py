@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from drivers.errors import IllegalCallError
 
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+Pixels = NDArray[np.unsignedinteger[Any]]
+"""Grey values, uint8 or uint16."""
 
 
 class DeviceState(IntEnum):
@@ -60,9 +61,7 @@ class Lifecycle:
         """Raise `IllegalCallError` unless ``move`` is allowed now; call it before touching the device."""
         allowed, _ = self._MOVES[move]
         if self.state not in allowed:
-            raise IllegalCallError(
-                self.device, self.state.name, move, " or ".join(s.name for s in sorted(allowed))
-            )
+            raise IllegalCallError(self.device, self.state.name, move, " or ".join(s.name for s in sorted(allowed)))
 
     def move(self, move: str) -> None:
         """Make the move, after the device has done its part."""
@@ -72,9 +71,7 @@ class Lifecycle:
     def require(self, call: str, *states: DeviceState) -> None:
         """Raise `IllegalCallError` unless the device is in one of ``states``."""
         if self.state not in states:
-            raise IllegalCallError(
-                self.device, self.state.name, call, " or ".join(s.name for s in sorted(states))
-            )
+            raise IllegalCallError(self.device, self.state.name, call, " or ".join(s.name for s in sorted(states)))
 
 
 @dataclass(frozen=True)
@@ -106,7 +103,7 @@ class FrameFormat:
     @property
     def saturated_dn(self) -> int:
         """The grey value (DN) at and above which a pixel says nothing."""
-        return 2**self.bits - 1
+        return (1 << self.bits) - 1
 
 
 @dataclass(frozen=True)

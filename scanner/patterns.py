@@ -111,7 +111,9 @@ class Plan:
         if self.mean - self.amplitude < -1e-9 or self.mean + self.amplitude > 1 + 1e-9 or self.amplitude <= 0:
             raise ValueError(f"A = {self.mean:g}, B = {self.amplitude:g}: A ± B must lie within 0..1 and B above 0")
         if self.mask is not None and self.mask.shape != (self.size[1], self.size[0]):
-            raise ValueError(f"mask {self.mask.shape} does not have the projector's shape {(self.size[1], self.size[0])}")
+            raise ValueError(
+                f"mask {self.mask.shape} does not have the projector's shape {(self.size[1], self.size[0])}"
+            )
 
     @property
     def frame_count(self) -> int:
@@ -121,7 +123,7 @@ class Plan:
     @property
     def axes(self) -> tuple[Axis, ...]:
         """The axes that are measured, x first."""
-        return tuple(a for a in ("x", "y") if any(s.axis == a for s in self.sequences))  # type: ignore[misc]
+        return tuple(a for a in ("x", "y") if any(s.axis == a for s in self.sequences))
 
     def first_slot(self, sequence: int) -> int:
         """Plan index of the first pattern of sequence ``sequence``."""

@@ -53,8 +53,8 @@ class Maps:
         Mean grey value A of round one, DN.
     variation
         Paper's B_v, the standard deviation of the modulation over the frequencies, DN; None with fewer than two.
-    misfit
-        χ² per degree of freedom of the one-path fit, over all axes.
+    misfit, misfit_dof
+        χ² per degree of freedom of the one-path fit, over all axes, and how many degrees of freedom that are.
     interreflection
         bool, the detected region.
     flags
@@ -85,6 +85,7 @@ class Maps:
     misfit: NDArray[np.float32]
     interreflection: NDArray[np.bool_]
     flags: NDArray[np.uint16]
+    misfit_dof: int = 0
     depth: NDArray[np.float32] | None = None
     points: NDArray[np.float32] | None = None
     sigma_point: NDArray[np.float32] | None = None
@@ -119,7 +120,8 @@ class ScanResult:
         Per-pixel results.
     summary
         JSON-ready: ``counts`` {name: pixels}, ``frames``, ``timings_s`` {stage: seconds}, ``quality`` {name: figure},
-        ``gates`` [{name, value, limit, passed, meaning}], ``noise`` {read_dn, dn_per_electron}, ``versions`` {package: version}.
+        ``gates`` [{name, value, limit, passed, meaning}], ``noise`` {read_dn,
+        dn_per_electron}, ``versions`` {package: version}.
     warnings
         Sentences for the operator.
     """

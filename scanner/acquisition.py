@@ -1,0 +1,371 @@
+"""The state machine that runs a method on a bench: one round or two, every sequence checked, everything journalled.
+
+    IDLE → PREFLIGHT → CAPTURING ⇄ REPEATING
+                          ↓  ↑ (round two)
+                        DECODING → COMPLETED          any state → CANCELLED | FAILED
+
+While one sequence is photographed, a second thread checks, commits and demodulates the one before it. A sequence that
+fails its check is taken again, at most as often as the scan allows. On every way out the projector is dark.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from drivers import Bench, HardwareError, OperatorError, Pixels
+from scanner.config import ScanSection
+from scanner.decoding import Decoder
+from scanner.integrity import check_sequence
+from scanner.methods import Method, RoundFrames
+from scanner.patterns import Plan
+from scanner.result import Maps
+from scanner.take import TakeWriter
+
+
+class ScanState(StrEnum):
+    """Where a scan is."""
+
+    IDLE = "idle"
+    PREFLIGHT = "preflight"
+    CAPTURING = "capturing"
+    REPEATING = "repeating"
+    DECODING = "decoding"
+    COMPLETED = "completed"
+    CANCELLED = "cancelled"
+    FAILED = "failed"
+
+
+_ENDS = frozenset({ScanState.COMPLETED, ScanState.CANCELLED, ScanState.FAILED})
+_LOST = frozenset({ScanState.CANCELLED, ScanState.FAILED})
+TRANSITIONS: Mapping[ScanState, frozenset[ScanState]] = {
+    ScanState.IDLE: frozenset({ScanState.PREFLIGHT}) | _LOST,
+    ScanState.PREFLIGHT: frozenset({ScanState.CAPTURING}) | _LOST,
+    ScanState.CAPTURING: frozenset({ScanState.REPEATING, ScanState.DECODING}) | _LOST,
+    ScanState.REPEATING: frozenset({ScanState.CAPTURING}) | _LOST,
+    ScanState.DECODING: frozenset({ScanState.CAPTURING, ScanState.COMPLETED}) | _LOST,
+    **{end: frozenset() for end in _ENDS},
+}
+"""The moves that a scan may make."""
+
+
+class AcquisitionError(HardwareError):
+    """The bench does not deliver frames that show the patterns."""
+
+
+class ExposureError(OperatorError):
+    """The picture is too bright or too dark to measure with."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a scan has come.
+
+    Parameters
+    ----------
+    round, rounds
+        From 1.
+    sequence, sequences
+        From 1; ``label`` names the sequence.
+    frame, frames
+        Within the sequence, from 1.
+    done, total
+        Frames of the whole scan as far as its rounds are known.
+    attempt
+        From 1.
+    """
+
+    round: int
+    rounds: int
+    sequence: int
+    sequences: int
+    label: str
+    frame: int
+    frames: int
+    done: int
+    total: int
+    attempt: int
+
+
+class Listener(Protocol):
+    """Who wants to know how a scan goes: the terminal, a window, a test."""
+
+    def state(self, state: ScanState, what: str) -> None:
+        """A new state was entered; ``what`` says it in words."""
+        ...
+
+    def frame(self, progress: Progress) -> None:
+        """A frame was taken."""
+        ...
+
+    def note(self, text: str) -> None:
+        """Something the operator should read."""
+        ...
+
+
+class Silence:
+    """A listener that ignores everything."""
+
+    def state(self, state: ScanState, what: str) -> None:
+        """Ignore."""
+
+    def frame(self, progress: Progress) -> None:
+        """Ignore."""
+
+    def note(self, text: str) -> None:
+        """Ignore."""
+
+
+@dataclass
+class Acquisition:
+    """One scan on an open bench.
+
+    Parameters
+    ----------
+    bench
+        Open; the caller closes it.
+    method, scan
+        What to do.
+    decoder
+        Decodes the rounds; knows noise and rig.
+    take
+        Where everything is recorded; the caller ends it.
+    listener
+        Is told how it goes.
+    """
+
+    bench: Bench
+    method: Method
+    scan: ScanSection
+    decoder: Decoder
+    take: TakeWriter
+    listener: Listener = field(default_factory=Silence)
+    state: ScanState = field(default=ScanState.IDLE, init=False)
+    timings_s: dict[str, float] = field(default_factory=dict, init=False)
+    frames: dict[int, int] = field(default_factory=dict, init=False)
+    repeats: int = field(default=0, init=False)
+    notes: list[str] = field(default_factory=list, init=False)
+    _done: int = field(default=0, init=False)
+
+    def run(self) -> Maps:
+        """Both rounds; returns the fused maps.
+
+        Raises
+        ------
+        ExposureError
+            The preflight pictures are too bright or too dark.
+        AcquisitionError
+            A sequence failed its check on every attempt.
+        HardwareError
+            A device failed.
+        """
+        try:
+            with self._dark_afterwards():
+                first_plan = self.method.first_round(self.scan, self.bench.projector_size)
+                self._enter(ScanState.PREFLIGHT, "exposure check")
+                self._preflight(first_plan)
+                first = self._capture(1, first_plan, first_plan.frame_count)
+                self._enter(ScanState.DECODING, "decoding round 1")
+                with self._timed("decode round 1"):
+                    second_plan = self.decoder.first(first)
+                if second_plan is not None:
+                    second = self._capture(2, second_plan, first_plan.frame_count + second_plan.frame_count)
+                    self._enter(ScanState.DECODING, "decoding round 2")
+                    with self._timed("decode round 2"):
+                        self.decoder.second(second)
+            self._enter(ScanState.COMPLETED, "done")
+            return self.decoder.maps
+        except KeyboardInterrupt:
+            self._enter(ScanState.CANCELLED, "interrupted by the operator")
+            raise
+        except BaseException:
+            self._enter(ScanState.FAILED, "failed")
+            raise
+
+    @contextmanager
+    def _dark_afterwards(self) -> Iterator[None]:
+        try:
+            yield
+        finally:
+            self.bench.darken()
+
+    @contextmanager
+    def _timed(self, what: str) -> Iterator[None]:
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.timings_s[what] = self.timings_s.get(what, 0.0) + time.perf_counter() - began
+
+    def _enter(self, state: ScanState, what: str) -> None:
+        if state not in TRANSITIONS[self.state]:
+            if self.state in _ENDS:
+                return
+            raise AssertionError(f"{self.state} → {state} is no move of a scan")
+        self.state = state
+        # A disk that failed must not hide why the scan ends.
+        if state in _LOST:
+            try:
+                self.take.state(state)
+            except (OperatorError, OSError):
+                self.listener.note("the last state could not be written to the recording")
+        else:
+            self.take.state(state)
+        self.listener.state(state, what)
+
+    def _note(self, text: str) -> None:
+        self.notes.append(text)
+        self.listener.note(text)
+
+    def _preflight(self, plan: Plan) -> None:
+        """Look at the brightest and the darkest picture before anything is measured."""
+        width, height = self.bench.projector_size
+        levels = (plan.mean + plan.amplitude, plan.mean - plan.amplitude)
+        pictures = [np.full((height, width), round(255 * level), np.uint8) for level in levels]
+        self.bench.prepare(pictures)
+        fmt = self.bench.frame_format
+        bright, dark = (np.empty(fmt.shape, fmt.dtype) for _ in range(2))
+        self.bench.expose(0, bright)
+        self.bench.expose(1, dark)
+        self.bench.darken()
+        check_exposure(bright, dark, fmt.saturated_dn, self.scan.max_saturated_share)
+
+    def _capture(self, number: int, plan: Plan, total: int) -> RoundFrames:
+        """Photograph all sequences of a round; returns what the method collected of them."""
+        self.take.begin_round(number, plan.to_json())
+        collected = self.method.collect(plan, self.bench.frame_format)
+        self._enter(ScanState.CAPTURING, f"round {number} of {self.method.rounds}")
+        fmt = self.bench.frame_format
+        longest = max(len(s.fringes) for s in plan.sequences)
+        # Two buffers take turns: one is being filled while the other is checked and demodulated.
+        buffers = [np.zeros((longest, *fmt.shape), fmt.dtype) for _ in range(2)]
+        queue = [(sequence, 1) for sequence in range(len(plan.sequences))]
+        pending: tuple[int, int, Future[list[str]]] | None = None
+        turn = 0
+        with ThreadPoolExecutor(1, thread_name_prefix="decode") as worker, self._timed(f"capture round {number}"):
+            try:
+                while queue or pending:
+                    launched = None
+                    if queue:
+                        sequence, attempt = queue.pop(0)
+                        frames = buffers[turn % 2][: len(plan.sequences[sequence].fringes)]
+                        turn += 1
+                        self._expose_sequence(number, plan, sequence, attempt, frames, total)
+                        job = self._finish_sequence(number, plan, sequence, attempt, frames, collected)
+                        launched = (sequence, attempt, worker.submit(job))
+                    if pending is not None:
+                        again = self._settle(number, plan, *pending)
+                        queue[:0] = again
+                    pending = launched
+            except BaseException:
+                # Before the worker is waited for: whatever went wrong, the light goes out at once.
+                self.bench.darken()
+                raise
+        self.bench.darken()
+        self.frames[number] = plan.frame_count
+        return collected
+
+    def _expose_sequence(
+        self, number: int, plan: Plan, sequence: int, attempt: int, frames: Pixels, total: int
+    ) -> None:
+        fringes = plan.sequences[sequence]
+        self.bench.prepare(plan.render(sequence))
+        for index in range(len(frames)):
+            stamp = self.bench.expose(index, frames[index])
+            self.take.write_frame(number, sequence, attempt, index, frames[index], stamp)
+            self._done += 1
+            self.listener.frame(
+                Progress(
+                    round=number,
+                    rounds=self.method.rounds,
+                    sequence=sequence + 1,
+                    sequences=len(plan.sequences),
+                    label=fringes.label,
+                    frame=index + 1,
+                    frames=len(frames),
+                    done=self._done,
+                    total=total + self.repeats,
+                    attempt=attempt,
+                )
+            )
+
+    def _finish_sequence(
+        self, number: int, plan: Plan, sequence: int, attempt: int, frames: Pixels, collected: RoundFrames
+    ) -> Callable[[], list[str]]:
+        """Check, record and demodulate; returns what is wrong with the sequence."""
+
+        def job() -> list[str]:
+            found = check_sequence(frames, plan.sequences[sequence], self.bench.frame_format.saturated_dn)
+            if not found.good:
+                reasons = [f.message for f in found.findings]
+                self.take.abort_sequence(number, sequence, attempt, "; ".join(reasons))
+                return reasons
+            self.take.commit_sequence(number, sequence, attempt)
+            collected.add(sequence, frames)
+            return []
+
+        return job
+
+    def _settle(
+        self, number: int, plan: Plan, sequence: int, attempt: int, job: Future[list[str]]
+    ) -> list[tuple[int, int]]:
+        """Wait for a sequence's check; returns it again, with the next attempt, where it failed."""
+        reasons = job.result()
+        if not reasons:
+            return []
+        label = plan.sequences[sequence].label
+        if attempt >= self.scan.attempts:
+            raise AcquisitionError(
+                f"round {number}, sequence {sequence + 1} ({label}) failed its check on {attempt} attempts: "
+                + "; ".join(reasons),
+                "Raise the bench's settle time (display latency), and check that nothing moves and no light flickers.",
+            )
+        count = len(plan.sequences[sequence].fringes)
+        self.repeats += count
+        self._enter(ScanState.REPEATING, f"{label}, attempt {attempt + 1}")
+        self._note(f"round {number}, {label}: {reasons[0]}; the sequence was taken again")
+        self._enter(ScanState.CAPTURING, f"round {number} of {self.method.rounds}")
+        return [(sequence, attempt + 1)]
+
+
+def check_exposure(bright: Pixels, dark: Pixels, saturated_dn: int, max_saturated_share: float) -> None:
+    """Refuse pictures that cannot be measured with.
+
+    Parameters
+    ----------
+    bright, dark
+        (H, W) frames of the brightest and the darkest level of the fringes.
+    saturated_dn
+        Grey value from which a pixel is saturated.
+    max_saturated_share
+        Share of the pixels that may be.
+
+    Raises
+    ------
+    ExposureError
+        Too many saturated pixels, or hardly any that the projector makes brighter.
+    """
+    share = float((bright >= saturated_dn).mean())
+    if share > max_saturated_share:
+        raise ExposureError(
+            f"exposure check: {100 * share:.1f} % of the pixels are saturated under full light, "
+            f"at most {100 * max_saturated_share:g} % may be",
+            "Shorten bench.camera.exposure_us, close the aperture, or allow more with scan.max_saturated_share.",
+        )
+    # Averaged over 8 × 8 pixels, so that noise does not pass for light.
+    contrast = cv2.blur(bright.astype(np.float32) - dark, (8, 8))
+    lit = float((contrast > max(0.02 * saturated_dn, 4)).mean())
+    if lit < 0.001:
+        raise ExposureError(
+            f"exposure check: the projector makes {100 * lit:.2f} % of the pixels brighter "
+            f"(brightest grey value {int(bright.max())} of {saturated_dn})",
+            "Take the lens caps off, switch the projector on, point both at the object, or lengthen the exposure.",
+        )

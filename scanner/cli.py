@@ -1,0 +1,277 @@
+"""The command line: `scan`, `scan process`, `scan compare`, `scan schema`.
+
+Exit codes: 0 done; 2 bad configuration or usage; 3 hardware; 4 the scan ran but its result fails its own quality gates;
+130 interrupted. Everything heavy is imported where it is used, so that `scan --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+if TYPE_CHECKING:
+    from scanner.config import GatesSection, LoadedConfig, ScanSection
+    from scanner.result import ScanResult
+    from scanner.terminal import Terminal
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+GATES_FAILED = 4
+INTERRUPTED = 130
+
+ConfigOption = Annotated[Path, typer.Option("--config", "-c", help="Bench file (YAML).", show_default=False)]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing result folder.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Plain lines instead of a progress bar.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Replace a value of the file: scan.steps=8.")
+]
+
+
+@app.callback(invoke_without_command=True)
+def scan(
+    context: typer.Context,
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="Bench file (YAML).")] = None,
+    method: Annotated[str | None, typer.Option("--method", "-m", help="mfs, tps, mps or mps_gn.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Result folder; default: scan-<time>.")] = None,
+    overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+    sets: SetOption = None,
+) -> None:
+    """Scan: project, photograph, compute, and write a result folder with point cloud and report."""
+    if context.invoked_subcommand is not None:
+        return
+    if config is None:
+        typer.echo(context.get_help())
+        raise typer.Exit(2)
+    from scanner.config import load_config
+    from scanner.terminal import Terminal
+
+    loaded = load_config(config, _overrides(sets, method))
+    terminal = Terminal(quiet)
+    terminal.say(loaded.warnings)
+    result, path = _scan(loaded, out or _default_out("scan"), overwrite, terminal)
+    terminal.table(result, path)
+    _exit_by_gates(result)
+
+
+@app.command()
+def process(
+    source: Annotated[Path, typer.Argument(help="A take, a result folder that holds one, or a folder of images.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Result folder; default: process-<time>.")] = None,
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="Its scan section replaces the take's.")] = None,
+    plan: Annotated[Path | None, typer.Option("--plan", help="Plan file of a folder of images.")] = None,
+    rig: Annotated[Path | None, typer.Option("--rig", help="Rig: own JSON or OpenCV FileStorage.")] = None,
+    method: Annotated[str, typer.Option("--method", "-m", help="How images are decoded: tps, mps or mfs.")] = "tps",
+    min_modulation: Annotated[
+        float | None, typer.Option("--min-modulation", help="Least fringe modulation of a valid pixel, DN.")
+    ] = None,
+    overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Compute everything after acquisition from recorded frames: a take, as far as it goes, or a folder of images."""
+    from scanner.folder import ResultFolder, write_result
+    from scanner.rig import Rig
+    from scanner.take import MANIFEST, Take
+    from scanner.terminal import Terminal
+
+    terminal = Terminal(quiet)
+    if (source / "take" / MANIFEST).exists():
+        source = source / "take"
+    chosen_rig = Rig.load(rig) if rig is not None else None
+    scan_section, gates = _sections(source, config, method, min_modulation)
+    with ResultFolder(out or _default_out("process"), overwrite=overwrite) as folder:
+        if (source / MANIFEST).exists() or (source / "journal.jsonl").exists():
+            from scanner.processing import process_take
+
+            take = Take.open(source)
+            terminal.say(take.describe())
+            document = take.manifest.get("rig")
+            if chosen_rig is None and document is not None:
+                chosen_rig = Rig.from_json(document)
+            with terminal.working() as report:
+                result = process_take(take, scan_section, gates, chosen_rig, report)
+        else:
+            from scanner.images import open_images
+            from scanner.processing import process_images
+
+            recorded = open_images(source, plan)
+            if chosen_rig is None and recorded.rig_path is not None:
+                chosen_rig = Rig.load(recorded.rig_path)
+            with terminal.working() as report:
+                result = process_images(recorded, scan_section, gates, chosen_rig, report)
+        if chosen_rig is None:
+            result.warnings.append(
+                "no rig is known: the result has projector coordinates and no points; name one with --rig"
+            )
+        with terminal.working() as report:
+            report("writing the result folder")
+            write_result(folder.path, result, rig=chosen_rig)
+    terminal.table(result, folder.out)
+    _exit_by_gates(result)
+
+
+@app.command()
+def compare(
+    config: ConfigOption,
+    methods: Annotated[str, typer.Option("--methods", help="Comma-separated names.")] = "mfs,tps,mps,mps_gn",
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder; default: comparison-<time>.")] = None,
+    reuse: Annotated[
+        Path | None, typer.Option("--reuse", help="A result folder of this scene: its method is not scanned again.")
+    ] = None,
+    overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+    sets: SetOption = None,
+) -> None:
+    """Scan with several methods and tabulate their errors after a plane fit in the largest bounce region."""
+    from scanner import comparison
+    from scanner.config import load_config
+    from scanner.folder import ComparisonFolder, read_result
+    from scanner.terminal import Terminal
+
+    terminal = Terminal(quiet)
+    results: dict[str, ScanResult] = {}
+    names = [name.strip() for name in methods.split(",") if name.strip()]
+    loads = {name: load_config(config, _overrides(sets, name)) for name in names}
+    with ComparisonFolder(out or _default_out("comparison"), overwrite=overwrite) as folder:
+        if reuse is not None:
+            known = read_result(reuse)
+            results[known.method] = known
+        for name in names:
+            if name not in results:
+                results[name], _ = _scan(loads[name], folder.path / name, False, terminal)
+        results = {name: results[name] for name in names}
+        region = next((r.maps.interreflection for r in results.values() if r.maps.interreflection.any()), None)
+        if region is None:
+            terminal.say(["no method of these detected a bounce: the whole picture is compared"])
+            region = next(iter(results.values())).maps.valid
+        rows, maps = comparison.compare(results, comparison.largest_region(region))
+        simulated = any(r.simulated for r in results.values())
+        comparison.picture(maps, rows, folder.path / "comparison.png", simulated)
+        folder.write_json("comparison.json", {"simulated": simulated, "rows": comparison.to_json(rows)})
+    terminal.comparison(rows, folder.out)
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of configuration files, for editors."""
+    import json
+
+    from scanner.config import json_schema
+
+    typer.echo(json.dumps(json_schema(), indent=2, ensure_ascii=False))
+
+
+def _scan(loaded: LoadedConfig, out: Path, overwrite: bool, terminal: Terminal) -> tuple[ScanResult, Path]:
+    """One scan into a result folder; returns the result and where it lies."""
+    from scanner.session import run_scan
+
+    return run_scan(loaded, out, overwrite, terminal)
+
+
+def _sections(
+    source: Path, config: Path | None, method: str, min_modulation: float | None
+) -> tuple[ScanSection, GatesSection]:
+    """Scan and gates sections: of a configuration, of the take's own, or defaults for images."""
+    import json
+
+    from scanner.config import GatesSection, ScanSection, load_config
+    from scanner.take import MANIFEST
+
+    changes = {} if min_modulation is None else {"minimum_modulation_dn": min_modulation}
+    if config is not None:
+        loaded = load_config(config, {f"scan.{k}": v for k, v in changes.items()})
+        return loaded.config.scan, loaded.config.gates
+    recorded: dict[str, Any] = {}
+    if (source / MANIFEST).exists():
+        from scanner.take import Take
+
+        recorded = Take.open(source).manifest.get("config") or {}
+    scan_document = dict(recorded.get("scan") or {"method": method})
+    scan_document.update(changes)
+    return (
+        ScanSection.model_validate_json(json.dumps(scan_document)),
+        GatesSection.model_validate_json(json.dumps(recorded.get("gates") or {})),
+    )
+
+
+def _overrides(sets: list[str] | None, method: str | None) -> dict[str, object]:
+    """Values from the command line, read as YAML scalars."""
+    from ruamel.yaml import YAML
+
+    found: dict[str, object] = {}
+    for item in sets or []:
+        key, equals, value = item.partition("=")
+        if not equals:
+            raise typer.BadParameter(f"--set {item}: write KEY=VALUE, such as scan.steps=8")
+        found[key.strip()] = YAML(typ="safe").load(value)
+    if method is not None:
+        found["scan.method"] = method
+    return found
+
+
+def _default_out(stem: str) -> Path:
+    from datetime import datetime
+
+    return Path(f"{stem}-{datetime.now():%Y%m%d-%H%M%S}")
+
+
+def _exit_by_gates(result: ScanResult) -> None:
+    from scanner.quality import passed
+
+    if not passed(result):
+        raise typer.Exit(GATES_FAILED)
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """A request to end (SIGTERM) is treated like Ctrl-C: the light goes out and the recording is closed."""
+
+    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def main() -> None:
+    """Entry point of `scan`: every error an operator can meet is a message, never a traceback."""
+    from drivers.errors import OperatorError
+
+    try:
+        with _terminable():
+            code = app(standalone_mode=False)
+    except OperatorError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    except typer.Abort:
+        sys.exit(INTERRUPTED)
+    except Exception as error:
+        _usage_or_raise(error)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _usage_or_raise(error: Exception) -> NoReturn:
+    """Show what the command-line parser refuses; anything else is a fault of the program and keeps its traceback."""
+    show = getattr(error, "show", None)
+    if show is None:
+        raise error
+    show()
+    sys.exit(getattr(error, "exit_code", 2))

@@ -1,0 +1,100 @@
+"""From collected frames to maps: the part of a scan that is the same for a live bench and for recorded frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from drivers import NoiseModel
+from scanner.config import ScanSection
+from scanner.methods import FirstRound, Method, RoundFrames, Setup
+from scanner.patterns import Plan
+from scanner.result import Flag, Maps
+from scanner.rig import Rig
+
+_ASSUMED_NOISE = NoiseModel(1.5)
+"""Where neither the camera nor the frames tell: an ordinary 8-bit camera."""
+
+
+@dataclass
+class Decoder:
+    """Decodes the rounds of one scan as they become complete.
+
+    Parameters
+    ----------
+    method, scan
+        What was projected and how it is judged.
+    noise
+        The camera's noise model; None takes it from the frames.
+    rig
+        Calibrated rig, or None: then there are coordinates and no points.
+    """
+
+    method: Method
+    scan: ScanSection
+    noise: NoiseModel | None
+    rig: Rig | None
+    warnings: list[str] = field(default_factory=list, init=False)
+    used_noise: NoiseModel | None = field(default=None, init=False)
+    _setup: Setup | None = field(default=None, init=False)
+    _first: FirstRound | None = field(default=None, init=False)
+    _maps: Maps | None = field(default=None, init=False)
+
+    def first(self, frames: RoundFrames) -> Plan | None:
+        """Decode round one; returns the plan of round two, or None where there is nothing more to do."""
+        self.used_noise = self._noise_of(frames)
+        self._setup = Setup(self.scan, self.used_noise, self.rig)
+        self._first = self.method.decode(frames, self._setup)
+        self._maps = self._first.maps
+        self.warnings += self._first.notes
+        return self.method.second_round(self._first, self._setup)
+
+    def second(self, frames: RoundFrames) -> None:
+        """Join round two; with sequences missing, only what round one could tell alone is kept."""
+        if self._first is None or self._setup is None:
+            raise AssertionError("round two is decoded after round one")
+        if len(frames.added) < len(frames.plan.sequences):
+            self.give_up_second(frames.plan)
+        else:
+            self._maps = self.method.fuse(self._first, frames, self._setup)
+
+    def give_up_second(self, plan: Plan) -> None:
+        """Say of the pixels that only round two could have told that the recording ended before it."""
+        maps = self.maps
+        flags = maps.flags.copy()
+        flags[maps.interreflection & ~maps.valid] |= np.uint16(Flag.INCOMPLETE)
+        self._maps = replace(maps, flags=flags, lit=plan.mask)
+        self.warnings.append(
+            "round two is not complete: the bounce region holds what round one could separate, and nothing else"
+        )
+
+    @property
+    def maps(self) -> Maps:
+        """The result so far."""
+        if self._maps is None:
+            raise AssertionError("nothing was decoded yet")
+        return self._maps
+
+    def _noise_of(self, frames: RoundFrames) -> NoiseModel:
+        """What the frames show goes before what the camera promises: it holds vibration and flicker too."""
+        observed = frames.estimate_noise()
+        if observed is None:
+            if self.noise is None:
+                self.warnings.append(
+                    f"neither camera nor frames tell the noise: {_ASSUMED_NOISE.read_dn:g} DN is assumed, and σ with it"
+                )
+            return self.noise or _ASSUMED_NOISE
+        if self.noise is not None:
+            ratio = _middle_sigma(observed) / _middle_sigma(self.noise)
+            if ratio > 1.3:
+                self.warnings.append(
+                    f"the frames are {ratio:.1f} × as noisy as the camera's model says: vibration, flicker, or a "
+                    "projector response that is not linear"
+                )
+        return observed
+
+
+def _middle_sigma(noise: NoiseModel) -> float:
+    """σ at the grey value 100, DN: one number to compare two models by."""
+    return float(np.sqrt(noise.variance(100.0)))

@@ -1,0 +1,332 @@
+"""Micro-frequency shifting (MFS) in two rounds (Optics Express 27(20) 28293; method.md §§2-7).
+
+Round one projects nine slightly different frequencies on each axis. Where the fringes of a pixel do not fit one path, a
+bounce arrives; there the two paths are separated. Round two lights only where the direct light of those pixels comes
+from, so that the bounce has no source. Inside the region the better of both answers is kept, if it passes its own test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2 as chi2_distribution
+
+from drivers import FrameFormat
+from scanner.config import ScanSection
+from scanner.interreflection import (
+    Detection,
+    detect,
+    misfit_statistic,
+    modulation_variation,
+    variation_statistic,
+)
+from scanner.methods.base import (
+    FirstRound,
+    RoundFrames,
+    Setup,
+    first_flags,
+    refuse_off_epipolar,
+    stepped_plan,
+)
+from scanner.methods.multi_frequency import DecodedAxis, decode_axes, one_path_maps
+from scanner.paths import choose_direct, separate_two_paths
+from scanner.patterns import Axis, Plan
+from scanner.phasors import RoundPhasors
+from scanner.regions import inside, literal_mask, sound_mask
+from scanner.result import Flag, Maps
+from scanner.rig import Rig
+from scanner.triangulation import triangulate
+
+FREQUENCIES = 9
+"""T: frequencies an axis; t = 0..8."""
+
+_REFUSED_ONE_IN = 1e4
+"""Of good coordinates one in so many is refused by its own χ²."""
+
+_HALO_PX = 2
+"""Round two also serves the pixels this near to the region, whose bounce is below detection."""
+
+_CLEARANCE_PX = 2
+"""Fringes this near to the end of the lit set are cut by the projector's blur."""
+
+_CLEAR_ORDERS = 10.0
+"""χ² by which the next best pair of fringe orders must fit worse."""
+
+_CLEAR_CHOICE = 2.0
+"""The direct path must be e² times as likely as the bounce to stand for the pixel."""
+
+
+def frequencies(extent: int) -> tuple[float, ...]:
+    """f_t = (n + t)/L, t = 0..8, with n the fringes of about 16 px in L px: (80 + t)/1280 for L = 1280."""
+    fringes = round(extent / 16)
+    return tuple((fringes + t) / extent for t in range(FREQUENCIES))
+
+
+@dataclass(frozen=True)
+class Separated:
+    """Direct path of the region's pixels from round one alone, arrays (P,) in the order of ``pixels``.
+
+    Parameters
+    ----------
+    pixels
+        Flat pixel numbers.
+    u, sigma, bounce
+        By axis: direct coordinate and its σ, and the coordinate of the other path, px; NaN where not known.
+    trusted
+        Whether the separation fits and the choice of the direct path is clear.
+    """
+
+    pixels: NDArray[np.intp]
+    u: dict[Axis, NDArray[np.float32]]
+    sigma: dict[Axis, NDArray[np.float32]]
+    bounce: dict[Axis, NDArray[np.float32]]
+    trusted: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class _Private:
+    decoded: dict[Axis, DecodedAxis]
+    detection: Detection
+    separated: Separated
+
+
+@dataclass(frozen=True)
+class MicroFrequencyShifting:
+    """MFS, two rounds."""
+
+    name: str = "mfs"
+    rounds: int = 2
+
+    def first_round(self, scan: ScanSection, size: tuple[int, int]) -> Plan:
+        """Nine frequencies an axis; both axes use those of the longer, as the paper does."""
+        own = frequencies(max(size))
+        return stepped_plan(scan, size, {"x": own, "y": own})
+
+    def collect(self, plan: Plan, frame_format: FrameFormat) -> RoundPhasors:
+        """Phasors of the frames."""
+        return RoundPhasors(plan, frame_format)
+
+    def decode(self, frames: RoundFrames, setup: Setup) -> FirstRound:
+        """Coordinates, detected region, and the two paths inside it."""
+        assert isinstance(frames, RoundPhasors)
+        decoded = decode_axes(frames, setup)
+        maps, usable = one_path_maps(frames, decoded, setup)
+        variations = [modulation_variation(_phasors(frames, a), d.gain) for a, d in decoded.items()]
+        coordinates = [d.coordinates for d in decoded.values()]
+        if setup.scan.detector == "variation":
+            counts = [len(d.gain) for d in decoded.values()]
+            statistic, dof = variation_statistic(variations, [d.sigma_z for d in decoded.values()], counts)
+        else:
+            statistic, dof = misfit_statistic(coordinates)
+        detection = detect(statistic, dof, coordinates, usable, setup.scan.false_alarm_rate)
+        separated = _separate(frames, decoded, detection, setup)
+        flags = first_flags(usable, frames.saturated, [u for u in (maps.x_p, maps.y_p) if u is not None])
+        flags[detection.region] |= np.uint16(Flag.INTERREFLECTION)
+        flags[detection.depth_edge] |= np.uint16(Flag.DEPTH_EDGE)
+        flags[detection.suspicious] |= np.uint16(Flag.MISFIT)
+        refused = detection.region | detection.depth_edge | detection.suspicious
+        known = {
+            a: (u, s) for a, u, s in (("x", maps.x_p, maps.sigma_x), ("y", maps.y_p, maps.sigma_y)) if u is not None
+        }
+        results: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
+        for axis, (u, sigma) in known.items():
+            u, sigma = u.copy(), sigma.copy()  # type: ignore[union-attr]
+            u[refused] = sigma[refused] = np.nan
+            _put(u, separated, separated.u[axis])  # type: ignore[index]
+            _put(sigma, separated, separated.sigma[axis])  # type: ignore[index]
+            results[axis] = (u, sigma)
+        flags.reshape(-1)[separated.pixels[separated.trusted]] |= np.uint16(Flag.SEPARATED)
+        untold = detection.region & ((flags & Flag.SEPARATED) == 0)
+        flags[untold] |= np.uint16(Flag.MISFIT)
+        x, sigma_x = results.get("x", (None, None))
+        y, sigma_y = results.get("y", (None, None))
+        first = replace(
+            maps,
+            x_p=x,
+            y_p=y,
+            sigma_x=sigma_x,
+            sigma_y=sigma_y,
+            variation=np.sqrt(np.mean(np.square(variations), axis=0, dtype=np.float32)),
+            interreflection=detection.region,
+            flags=flags,
+            x_p_round1=maps.x_p,
+            y_p_round1=maps.y_p,
+        )
+        return FirstRound(refuse_off_epipolar(first, setup.rig), frames.plan, _Private(decoded, detection, separated))
+
+    def second_round(self, first: FirstRound, setup: Setup) -> Plan | None:
+        """The same fringes, lit only where the scan's rule says; None where no bounce was detected."""
+        assert isinstance(first.private, _Private)
+        if not first.private.detection.region.any():
+            return None
+        size = first.plan.size
+        if setup.scan.regional_rule == "literal":
+            undetected = ~first.private.detection.region
+            x, y = first.maps.x_p_round1, first.maps.y_p_round1
+            shape = undetected.sum()
+            nothing = np.full(shape, np.nan, np.float32)
+            mask = literal_mask(nothing if x is None else x[undetected], nothing if y is None else y[undetected], size)
+        else:
+            s = first.private.separated
+            nothing = np.full(int(s.trusted.sum()), np.nan, np.float32)
+            direct = [s.u[a][s.trusted] if a in s.u else nothing for a in ("x", "y")]
+            bounce = [s.bounce[a][s.trusted] if a in s.bounce else nothing for a in ("x", "y")]
+            mask = sound_mask(direct[0], direct[1], size, setup.scan.lit_margin_px, (bounce[0], bounce[1]))
+        if not mask.any():
+            return None
+        return replace(first.plan, mask=mask)
+
+    def fuse(self, first: FirstRound, second: RoundFrames, setup: Setup) -> Maps:
+        """Inside the region the answer with the smaller σ among those that pass; outside, round one."""
+        assert isinstance(first.private, _Private)
+        assert isinstance(second, RoundPhasors)
+        private, lit = first.private, second.plan.mask
+        assert lit is not None
+        decoded = decode_axes(second, setup, {a: d.gain for a, d in private.decoded.items()})
+        if set(decoded) != set(private.decoded):
+            return replace(first.maps, lit=lit)
+        coordinates = [d.coordinates for d in decoded.values()]
+        total, dof = misfit_statistic(coordinates)
+        maps2, usable = one_path_maps(second, decoded, setup)
+        region = private.detection.region
+        target = _dilated(region, _HALO_PX) & ~private.detection.depth_edge
+        limit = chi2_distribution.isf(1 / _REFUSED_ONE_IN, dof) * private.detection.excess_noise
+        x2, y2 = maps2.x_p, maps2.y_p
+        lit_here = _lit_here(lit, x2, y2)
+        fits = total < np.float32(limit)
+        passed = target & usable & fits & lit_here & maps2.valid
+        flags = first.maps.flags.copy()
+        flags[region & usable & ~lit_here & maps2.valid] |= np.uint16(Flag.NOT_LIT)
+        flags[region & second.saturated] |= np.uint16(Flag.SATURATED)
+        one = first.maps
+        better = passed & ~_smaller(one, maps2)
+
+        def merged(old: NDArray[np.float32] | None, new: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+            return None if old is None or new is None else np.where(better, new, old)
+
+        flags[better] |= np.uint16(Flag.SECOND_ROUND)
+        flags[better] &= ~np.uint16(
+            Flag.SEPARATED | Flag.MISFIT | Flag.NOT_LIT | Flag.OFF_EPIPOLAR | Flag.OUT_OF_VOLUME
+        )
+        fused = replace(
+            one,
+            flags=flags,
+            misfit_round2=np.where(target & usable, total / np.float32(dof), np.float32(np.nan)),
+            lit=lit,
+            x_p=merged(one.x_p, maps2.x_p),
+            y_p=merged(one.y_p, maps2.y_p),
+            sigma_x=merged(one.sigma_x, maps2.sigma_x),
+            sigma_y=merged(one.sigma_y, maps2.sigma_y),
+        )
+        return refuse_off_epipolar(fused, setup.rig)
+
+
+def _separate(frames: RoundPhasors, decoded: dict[Axis, DecodedAxis], detection: Detection, setup: Setup) -> Separated:
+    """Two paths of every region pixel on every axis, and which of them is direct."""
+    pixels = np.flatnonzero(detection.region)
+    empty = Separated(pixels, {}, {}, {}, np.zeros(pixels.size, bool))
+    axes: Sequence[Axis] = tuple(decoded)
+    if not pixels.size or any(not _equidistant(_phasors(frames, a).frequency) for a in axes):
+        nan = np.full(pixels.size, np.nan, np.float32)
+        return replace(
+            empty, u=dict.fromkeys(axes, nan), sigma=dict.fromkeys(axes, nan), bounce=dict.fromkeys(axes, nan)
+        )
+    found = {}
+    for axis in axes:
+        phasors = _phasors(frames, axis)
+        z = phasors.z.reshape(len(phasors.frequency), -1)[:, pixels]
+        sigma_z = decoded[axis].sigma_z.reshape(-1)[pixels] * np.float32(np.sqrt(detection.excess_noise))
+        found[axis] = separate_two_paths(z, phasors.frequency, sigma_z, frames.plan.extent(axis), decoded[axis].gain)
+    distance = sigma = None
+    if setup.rig is not None and len(axes) == 2:
+        distance, sigma = _epipolar_distances(
+            setup.rig, pixels, found["x"].u, found["y"].u, found["x"].sigma_u, found["y"].sigma_u
+        )
+    choice = choose_direct(*(found[a] for a in axes), distance_px=distance, sigma_px=sigma)
+    picks = dict(zip(axes, (choice.ix, choice.iy), strict=False))
+    column = np.arange(pixels.size)
+    trusted = choice.confidence > _CLEAR_CHOICE
+    u, spread, bounce = {}, {}, {}
+    for axis in axes:
+        two, pick = found[axis], picks[axis]
+        u[axis], spread[axis] = two.u[pick, column], two.sigma_u[pick, column]
+        bounce[axis] = two.u[1 - pick, column]
+        trusted &= two.converged & (two.chi2 < chi2_distribution.isf(1 / _REFUSED_ONE_IN, two.dof))
+        trusted &= two.margin > _CLEAR_ORDERS
+        extent = frames.plan.extent(axis)
+        trusted &= (u[axis] >= -0.5) & (u[axis] <= extent - 0.5)
+    return Separated(pixels, u, spread, bounce, trusted)
+
+
+def _epipolar_distances(
+    rig: Rig,
+    pixels: NDArray[np.intp],
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    sigma_x: NDArray[np.float32],
+    sigma_y: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(4, P) distance (px) of each (x_i, y_j), ij = 00, 01, 10, 11, from its pixel's epipolar line, and its σ."""
+    width, height = rig.camera.size
+    distance = np.empty((4, pixels.size), np.float32)
+    sigma = np.empty_like(distance)
+    blank = np.full(width * height, np.nan, np.float32)
+    for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
+        planes = []
+        for values in (x[i], sigma_x[i], y[j], sigma_y[j]):
+            plane = blank.copy()
+            plane[pixels] = values
+            planes.append(plane.reshape(height, width))
+        found = triangulate(rig, *planes)
+        assert found.epipolar_px is not None
+        assert found.epipolar_sigmas is not None
+        distance[k] = found.epipolar_px.reshape(-1)[pixels]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sigma[k] = np.abs(distance[k] / found.epipolar_sigmas.reshape(-1)[pixels])
+    return distance, sigma
+
+
+def _phasors(frames: RoundPhasors, axis: Axis):  # type: ignore[no-untyped-def]
+    phasors = frames.axis(axis)
+    assert phasors is not None
+    return phasors
+
+
+def _equidistant(frequency: NDArray[np.float64]) -> bool:
+    gaps = np.diff(frequency)
+    return frequency.size >= 5 and bool(np.allclose(gaps, gaps[0], rtol=1e-6))
+
+
+def _put(plane: NDArray[np.float32], separated: Separated, values: NDArray[np.float32]) -> None:
+    plane.reshape(-1)[separated.pixels[separated.trusted]] = values[separated.trusted]
+
+
+def _dilated(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc) > 0)
+
+
+def _lit_here(
+    lit: NDArray[np.bool_], x: NDArray[np.float32] | None, y: NDArray[np.float32] | None
+) -> NDArray[np.bool_]:
+    """Whether a coordinate of round two lies where it was lit and its fringes were whole."""
+    if x is not None and y is not None:
+        return inside(lit, x, y, _CLEARANCE_PX)
+    if x is not None:
+        return inside(np.broadcast_to(lit.any(axis=0), lit.shape).copy(), x, np.zeros_like(x), _CLEARANCE_PX)
+    assert y is not None
+    return inside(np.broadcast_to(lit.any(axis=1)[:, None], lit.shape).copy(), np.zeros_like(y), y, _CLEARANCE_PX)
+
+
+def _smaller(one: Maps, two: Maps) -> NDArray[np.bool_]:
+    """Where round one's own answer (separated paths) has the smaller predicted variance."""
+    variances = []
+    for maps in (one, two):
+        parts = [s**2 for s in (maps.sigma_x, maps.sigma_y) if s is not None]
+        variances.append(np.sum(parts, axis=0))
+    with np.errstate(invalid="ignore"):
+        return one.valid & np.asarray(variances[0] < variances[1])

@@ -1,0 +1,136 @@
+"""Everything after acquisition, on recorded frames: a take, as far as it goes, or a folder of images."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+from scanner.config import GatesSection, ScanSection
+from scanner.decoding import Decoder
+from scanner.images import ImagesError, RecordedFrames
+from scanner.integrity import check_sequence
+from scanner.methods import METHODS, Method, RoundFrames
+from scanner.patterns import Plan
+from scanner.quality import summarise
+from scanner.result import ScanResult
+from scanner.rig import Rig
+from scanner.take import Take, TakeError
+
+Report = Callable[[str], None]
+"""Is told in words how far the processing is."""
+
+
+def process_take(
+    take: Take, scan: ScanSection, gates: GatesSection, rig: Rig | None, report: Report = lambda _: None
+) -> ScanResult:
+    """Decode a take as far as it goes.
+
+    Damaged sequences are left out and said so; an axis whose frequencies no longer reach over the projector is left
+    out; without a complete round two the bounce region holds what round one tells.
+
+    Raises
+    ------
+    TakeError
+        Round one holds nothing that can be decoded.
+    PlanError
+        No axis can be told from the sequences that are there.
+    """
+    method = METHODS[str(take.manifest["method"])]
+    began = time.perf_counter()
+    decoder = Decoder(method, scan, take.noise, rig)
+    warnings = list(take.problems)
+    if take.status != "completed":
+        warnings.append(f"the recording is {take.status}" + (f": {take.reason}" if take.reason else ""))
+    if 1 not in take.rounds:
+        raise TakeError(f"{take.path}: round one was not begun", "There is nothing to process; scan again.")
+    first = _collect(take, 1, method, warnings, report)
+    timings = {"read and demodulate round 1": time.perf_counter() - began}
+    began = time.perf_counter()
+    report("decoding round 1")
+    planned = decoder.first(first)
+    timings["decode round 1"] = time.perf_counter() - began
+    frames = {"round 1": sum(len(s.frames) for s in take.sequences(1).values())}
+    if 2 in take.rounds:
+        began = time.perf_counter()
+        second = _collect(take, 2, method, warnings, report)
+        report("decoding round 2")
+        decoder.second(second)
+        timings["decode round 2"] = time.perf_counter() - began
+        frames["round 2"] = sum(len(s.frames) for s in take.sequences(2).values())
+    elif planned is not None:
+        decoder.give_up_second(replace(planned, mask=None))
+    assert decoder.used_noise is not None
+    return summarise(
+        method.name,
+        decoder.maps,
+        simulated=take.simulated,
+        gates=gates,
+        noise=decoder.used_noise,
+        frames=frames,
+        timings_s=timings,
+        warnings=[*warnings, *decoder.warnings],
+    )
+
+
+def process_images(
+    recorded: RecordedFrames,
+    scan: ScanSection,
+    gates: GatesSection,
+    rig: Rig | None,
+    report: Report = lambda _: None,
+) -> ScanResult:
+    """Decode a folder of images; one round, by the method that ``scan`` names.
+
+    Raises
+    ------
+    ImagesError
+        The images do not hold what their plan says.
+    """
+    method = METHODS[scan.method]
+    began = time.perf_counter()
+    decoder = Decoder(method, scan, recorded.noise, rig)
+    frames = method.collect(recorded.plan, recorded.frame_format)
+    for number, pixels in recorded.sequences():
+        fringes = recorded.plan.sequences[number]
+        report(f"sequence {number + 1} of {len(recorded.plan.sequences)}: {fringes.label}")
+        found = check_sequence(pixels, fringes, recorded.frame_format.saturated_dn)
+        if not found.good:
+            names = [p.name for p in recorded.files[number]]
+            raise ImagesError(
+                f"{recorded.folder}: the images {', '.join(names)} do not show sequence {number + 1} ({fringes.label}): "
+                + "; ".join(f"{names[f.frame]}: {f.message}" for f in found.findings),
+                "Correct the order of `files` or of `sequences`, or the phase convention, in the plan file.",
+            )
+        frames.add(number, pixels)
+    timings = {"read and demodulate": time.perf_counter() - began}
+    began = time.perf_counter()
+    report("decoding")
+    decoder.first(frames)
+    timings["decode"] = time.perf_counter() - began
+    assert decoder.used_noise is not None
+    return summarise(
+        method.name,
+        decoder.maps,
+        simulated=False,
+        gates=gates,
+        noise=decoder.used_noise,
+        frames={"images": recorded.plan.frame_count},
+        timings_s=timings,
+        warnings=decoder.warnings,
+    )
+
+
+def _collect(take: Take, number: int, method: Method, warnings: list[str], report: Report) -> RoundFrames:
+    plan = Plan.from_json(take.rounds[number])
+    frames = method.collect(plan, take.frame_format)
+    there = take.sequences(number)
+    for sequence in there:
+        report(f"round {number}, sequence {sequence + 1} of {len(plan.sequences)}: {plan.sequences[sequence].label}")
+        try:
+            pixels = take.frames(number, sequence)
+        except TakeError as error:
+            warnings.append(f"left out: {error.message}")
+            continue
+        frames.add(sequence, pixels)
+    return frames

@@ -1,0 +1,137 @@
+"""One scan from configuration to result folder: what `scan` does, as a function."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drivers import Bench
+from scanner.acquisition import Acquisition, Listener
+from scanner.config import ConfigError, LoadedConfig, Problem, open_bench
+from scanner.decoding import Decoder
+from scanner.folder import ResultFolder, write_result
+from scanner.methods import METHODS
+from scanner.quality import summarise
+from scanner.result import ScanResult
+from scanner.rig import Rig
+from scanner.take import TakeWriter
+
+if TYPE_CHECKING:
+    from scanner.patterns import Plan
+
+
+def run_scan(loaded: LoadedConfig, out: Path, overwrite: bool, listener: Listener) -> tuple[ScanResult, Path]:
+    """Scan and write the result folder.
+
+    Parameters
+    ----------
+    loaded
+        A valid configuration.
+    out
+        The result folder; an existing one is refused unless ``overwrite``.
+    listener
+        Is told how it goes.
+
+    Returns
+    -------
+    result, path
+        The result and its folder.
+
+    Raises
+    ------
+    OperatorError
+        Whatever goes wrong; the recording is kept, and the projector is dark.
+    """
+    config = loaded.config
+    method = METHODS[config.scan.method]
+    began = time.perf_counter()
+    with ResultFolder(out, overwrite=overwrite) as folder:
+        with open_bench(loaded) as bench:
+            opened = time.perf_counter()
+            rig = find_rig(loaded, bench)
+            plan = method.first_round(config.scan, bench.projector_size)
+            with _begin_take(folder.path / "take", loaded, bench, rig, plan, method.rounds) as take:
+                decoder = Decoder(method, config.scan, bench.noise, rig)
+                acquisition = Acquisition(bench, method, config.scan, decoder, take, listener)
+                maps = acquisition.run()
+            simulated = bench.simulated
+        assert decoder.used_noise is not None
+        timings = {"open bench": opened - began, **acquisition.timings_s}
+        frames = {f"round {r}": n for r, n in acquisition.frames.items()} | {"repeated": acquisition.repeats}
+        result = summarise(
+            method.name,
+            maps,
+            simulated=simulated,
+            gates=config.gates,
+            noise=decoder.used_noise,
+            frames=frames,
+            timings_s=timings,
+            warnings=[*loaded.warnings, *acquisition.notes, *decoder.warnings],
+        )
+        write_result(
+            folder.path,
+            result,
+            rig=rig,
+            config_yaml=loaded.effective_yaml("rig.json"),
+            ply=config.output.ply,
+            report=config.output.report,
+        )
+        if not config.output.keep_take:
+            folder.discard_take()
+    return result, folder.out
+
+
+def find_rig(loaded: LoadedConfig, bench: Bench) -> Rig:
+    """Rig of the configuration or of the bench, checked against the bench's sizes.
+
+    Raises
+    ------
+    ConfigError
+        There is none, or it belongs to another camera or projector.
+    """
+    if loaded.rig_path is not None:
+        rig = Rig.load(loaded.rig_path)
+    elif bench.rig is not None:
+        rig = Rig.from_json(dict(bench.rig))
+    else:
+        raise _refused(
+            loaded,
+            f"found null, expected a rig: bench {bench.name} has none of its own",
+            "calibrate, then name its rig.json",
+        )
+    fmt = bench.frame_format
+    for what, found, wanted in (
+        ("camera", tuple(rig.camera.size), (fmt.width, fmt.height)),
+        ("projector", tuple(rig.projector.size), tuple(bench.projector_size)),
+    ):
+        if found != wanted:
+            raise _refused(
+                loaded,
+                f"the rig's {what} has {found[0]} × {found[1]} px, the bench's has {wanted[0]} × {wanted[1]} px",
+                f"name the rig that was calibrated with this {what} at this resolution",
+            )
+    return rig
+
+
+def _refused(loaded: LoadedConfig, what: str, remedy: str) -> ConfigError:
+    return ConfigError.of([Problem(str(loaded.path), None, None, "rig", what, remedy)])
+
+
+def _begin_take(path: Path, loaded: LoadedConfig, bench: Bench, rig: Rig, plan: Plan, rounds: int) -> TakeWriter:
+    noise = bench.noise
+    return TakeWriter.create(
+        path,
+        frame_format=bench.frame_format,
+        slots=rounds * plan.frame_count,
+        manifest={
+            "method": loaded.config.scan.method,
+            "bench": dict(bench.describe()),
+            "config": loaded.config.model_dump(mode="json"),
+            "plans": [plan.to_json()],
+            "simulated": bench.simulated,
+            "rig": rig.to_json(),
+            "noise": None if noise is None else {"read_dn": noise.read_dn, "dn_per_electron": noise.dn_per_electron},
+        },
+        clock=bench.clock,
+    )

@@ -1,0 +1,84 @@
+"""Computed light transport kept on disk, by content: the same scene, rig and settings are traced once."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import tempfile
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+
+from sim_backend.settings import SimulatedSettings
+from sim_backend.transport import Transport, trace
+
+_log = logging.getLogger(__name__)
+_VERSION = 1
+"""Raise it when tracing the same scene gives other matrices or the file's layout changes."""
+
+
+def transport_of(settings: SimulatedSettings) -> Transport:
+    """The light transport of a bench, from the cache or traced anew and cached.
+
+    A cache that cannot be read or written costs time, never the scan.
+    """
+    path = _folder(settings) / f"transport-{_content_hash(settings)}.npz"
+    if path.exists():
+        try:
+            # Reading a zip member checks its CRC-32: a damaged file does not pass.
+            with np.load(path, allow_pickle=False) as stored:
+                transport = Transport.from_arrays({name: stored[name] for name in stored.files})
+            os.utime(path)
+            return transport
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            _log.warning("cached light transport %s is damaged (%s) and is traced again", path, error)
+    transport = trace(settings.scene.surfaces(), settings.rig(), settings.transport)
+    try:
+        _store(transport, path, settings.cache_limit_mb * 1_000_000)
+    except OSError as error:
+        _log.warning("light transport cannot be cached in %s (%s) and is traced anew each time", path.parent, error)
+    return transport
+
+
+def _folder(settings: SimulatedSettings) -> Path:
+    if settings.cache_dir is not None:
+        return settings.cache_dir
+    named = os.environ.get("MFS_SCANNER_CACHE")
+    return Path(named) if named else Path(platformdirs.user_cache_dir("mfs-scanner", appauthor=False))
+
+
+def _content_hash(settings: SimulatedSettings) -> str:
+    content = {
+        "version": _VERSION,
+        "scene": settings.scene.model_dump(mode="json"),
+        "rig": settings.rig().to_json(),
+        "transport": settings.transport.model_dump(mode="json"),
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _store(transport: Transport, path: Path, limit_bytes: int) -> None:
+    """Write under a temporary name, rename when complete, then delete the longest unused until the limit is kept."""
+    arrays = transport.to_arrays()
+    if sum(a.nbytes for a in arrays.values()) > limit_bytes:
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
+        try:
+            np.savez(file, allow_pickle=False, **arrays)
+            file.close()
+            os.replace(file.name, path)
+        except BaseException:
+            Path(file.name).unlink(missing_ok=True)
+            raise
+    kept = sorted(path.parent.glob("transport-*.npz"), key=lambda p: p.stat().st_mtime, reverse=True)
+    total = 0
+    for entry in kept:
+        total += entry.stat().st_size
+        if total > limit_bytes and entry != path:
+            entry.unlink(missing_ok=True)

@@ -1,0 +1,240 @@
+"""What the camera sees: rays from its pixels to lit surfaces, at first sight or by way of a mirror."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from sim_backend.kernels import Floats, SparseRows, in_parallel, reflected_radiance, spread_spots
+from sim_backend.raycasting import CLEARANCE_MM, Hits, RayCaster
+from sim_backend.reflection import scatter_specular, unit
+from sim_backend.surfaces import Array
+from sim_backend.viewpoint import Viewpoint, bilinear_shares
+
+_RAYS_AT_ONCE = 50_000
+_MIRROR_LIKE_RAD = 0.02
+"""Lobes up to this broad are followed from the camera; broader ones would need more rays than a pixel has."""
+
+
+class Joinable:
+    """A dataclass of arrays that belong together element by element."""
+
+    @classmethod
+    def joined(cls, parts: Iterable[Self]) -> Self:
+        """All parts in one, in their order."""
+        parts = list(parts)
+        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, eq=False)
+class View(Joinable):
+    """What the rays through the camera's pixel centres meet; arrays of the camera's (height, width).
+
+    Parameters
+    ----------
+    surface
+        int8, number of the surface, −1 for none.
+    depth
+        float32, mm along the camera's axis, NaN for none.
+    x_p, y_p
+        float32, the projector px that lights the point, NaN where no direct light comes from.
+    mixed
+        bool, the pixel's rays meet different surfaces, or light and shadow.
+    """
+
+    surface: NDArray[np.int8]
+    depth: Floats
+    x_p: Floats
+    y_p: Floats
+    mixed: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Paths(Joinable):
+    """Light paths that end in camera pixels.
+
+    Parameters
+    ----------
+    pixel
+        (n,) int32 camera pixel, counted row by row.
+    u, v
+        (n,) float32 projector px they began at.
+    weight
+        (n,) float32 what the pixel's radiance gets of a full projector pixel.
+    """
+
+    pixel: NDArray[np.int32]
+    u: Floats
+    v: Floats
+    weight: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Glimpses(Joinable):
+    """What pixels see in a mirror.
+
+    Parameters
+    ----------
+    pixel, of
+        (n,) int32 the pixel, and the one that sees the same place directly.
+    share
+        (n,) float32 part of that one's radiance.
+    """
+
+    pixel: NDArray[np.int32]
+    of: NDArray[np.int32]
+    share: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPaths:
+    """All that rays from the camera find.
+
+    Parameters
+    ----------
+    view
+        What the pixel centres see.
+    direct
+        (camera pixels, projector pixels) radiance of direct light.
+    by_mirror
+        Light that goes projector, surface, mirror, camera.
+    seen_in_mirror
+        (camera pixels, camera pixels) what a pixel sees of others' places in a mirror.
+    """
+
+    view: View
+    direct: SparseRows
+    by_mirror: Paths
+    seen_in_mirror: SparseRows
+
+
+def trace_camera(
+    caster: RayCaster, camera: Viewpoint, projector: Viewpoint, supersample: int, bounces: int
+) -> CameraPaths:
+    """Follow ``supersample``² rays of each camera pixel, by at most ``bounces`` mirrors.
+
+    A pixel's value is the mean radiance (flux per mm² and sr) of what its rays meet; a projector pixel that is fully
+    on sends out a flux of 1.
+    """
+    width, height = camera.lens.size
+    rows = max(1, _RAYS_AT_ONCE // (width * supersample**2))
+    tracer = _Tracer(caster, camera, projector, supersample, bounces)
+    blocks = list(in_parallel(lambda r: tracer.trace(r, min(r + rows, height)), range(0, height, rows)))
+    glimpses = Glimpses.joined(b[3] for b in blocks)
+    pixels = width * height
+    seen = sparse.csr_array((glimpses.share, (glimpses.pixel, glimpses.of)), shape=(pixels, pixels))
+    return CameraPaths(
+        View.joined(b[0] for b in blocks),
+        SparseRows.stacked([b[1] for b in blocks]),
+        Paths.joined(b[2] for b in blocks),
+        SparseRows.of(seen),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracer:
+    caster: RayCaster
+    camera: Viewpoint
+    projector: Viewpoint
+    supersample: int
+    bounces: int
+
+    def trace(self, first_row: int, end_row: int) -> tuple[View, SparseRows, Paths, Glimpses]:
+        """Rows ``first_row`` to ``end_row`` of the picture."""
+        width, rays = self.camera.lens.size[0], self.supersample**2
+        shape = (end_row - first_row, width)
+        y, x = np.mgrid[first_row:end_row, :width].astype(np.float64)
+
+        direction = unit(self.camera.rays(np.stack((x, y), -1).reshape(-1, 2)))
+        centre = self.caster.first_hits(self.camera.centre, direction)
+        uv, radiance = self.lit(centre, -direction)
+        x_p, y_p = np.where(self.in_picture(uv) & (radiance > 0), uv.T, np.nan)
+
+        offset = (np.arange(self.supersample) + 0.5) / self.supersample - 0.5
+        dy, dx = (d.ravel() for d in np.meshgrid(offset, offset, indexing="ij"))
+        direction = unit(self.camera.rays(np.stack((x[..., None] + dx, y[..., None] + dy), -1).reshape(-1, 2)))
+        hits = self.caster.first_hits(self.camera.centre, direction)
+        sub_uv, sub_radiance = self.lit(hits, -direction)
+
+        surfaces, lit = hits.surface.reshape(-1, rays), (sub_radiance > 0).reshape(-1, rays)
+        mixed = (surfaces != centre.surface[:, None]).any(1) | (lit != (radiance > 0)[:, None]).any(1)
+        u, v = np.nan_to_num(sub_uv).astype(np.float32).T
+        direct = spread_spots(
+            np.arange(0, len(direction) + 1, rays, dtype=np.int64),
+            np.arange(len(direction), dtype=np.int32),
+            (sub_radiance / rays).astype(np.float32),
+            u,
+            v,
+            self.projector.lens.size,
+        )
+        view = View(
+            centre.surface.astype(np.int8).reshape(shape),
+            centre.point[:, 2].astype(np.float32).reshape(shape),
+            x_p.astype(np.float32).reshape(shape),
+            y_p.astype(np.float32).reshape(shape),
+            mixed.reshape(shape),
+        )
+        pixel = np.repeat(np.arange(first_row * width, end_row * width, dtype=np.int32), rays)
+        return view, direct, *self.by_mirror(pixel, direction, hits)
+
+    def lit(self, hits: Hits, to_eye: Array) -> tuple[Array, Array]:
+        """Projector px (n, 2) of hit points, and the radiance (n,) that direct light gives them towards the eye."""
+        uv = self.projector.project(hits.point)
+        irradiance = self.projector.density(uv, hits.point, hits.normal)
+        radiance = reflected_radiance(
+            self.caster.materials,
+            hits.surface,
+            self.projector.centre,
+            hits.point,
+            hits.normal,
+            to_eye,
+            irradiance,
+        )
+        at = np.flatnonzero(radiance > 0)
+        radiance[at] *= self.caster.visible(hits.point[at], hits.normal[at], self.projector.centre)
+        return uv, radiance
+
+    def in_picture(self, uv: Array) -> NDArray[np.bool_]:
+        """(n,) whether projector px (n, 2) are within the projector's picture."""
+        size = np.array(self.projector.lens.size)
+        with np.errstate(invalid="ignore"):
+            return np.asarray((np.abs(uv - (size - 1) / 2) <= size / 2).all(1))
+
+    def by_mirror(self, pixel: NDArray[np.int32], direction: Array, hits: Hits) -> tuple[Paths, Glimpses]:
+        """Follow rays that have met a mirror to lit surfaces, and to what other pixels see directly."""
+        none, nowhere = np.empty(0, np.float32), np.empty(0, np.int32)
+        paths, glimpses = [Paths(nowhere, none, none, none)], [Glimpses(nowhere, nowhere, none)]
+        random = np.random.default_rng(int(pixel[0]))
+        share = np.full(len(pixel), 1 / self.supersample**2)
+        for _ in range(self.bounces):
+            turned, reflected = np.empty_like(direction), np.zeros(len(direction))
+            for number, surface in enumerate(self.caster.surfaces):
+                if surface.material.specular > 0 and surface.material.lobe_rad <= _MIRROR_LIKE_RAD:
+                    at = np.flatnonzero(hits.surface == number)
+                    turned[at], reflected[at] = scatter_specular(
+                        surface.material, direction[at], hits.normal[at], random.random((at.size, 2))
+                    )
+            on = np.flatnonzero(reflected > 0)
+            if on.size == 0:
+                break
+            pixel, direction, share = pixel[on], turned[on], share[on] * reflected[on]
+            hits = self.caster.first_hits(hits.point[on] + CLEARANCE_MM * hits.normal[on], direction)
+            uv, radiance = self.lit(hits, -direction)
+            at = np.flatnonzero(radiance > 0)
+            u, v = uv[at].T.astype(np.float32)
+            paths.append(Paths(pixel[at], u, v, (share * radiance)[at].astype(np.float32)))
+            glimpses.append(self.glimpses(pixel, share, hits))
+        return Paths.joined(paths), Glimpses.joined(glimpses)
+
+    def glimpses(self, pixel: NDArray[np.int32], share: Array, hits: Hits) -> Glimpses:
+        """Which camera pixels see the hit points directly."""
+        xy = self.camera.project(hits.point)
+        at = np.flatnonzero(self.camera.density(xy, hits.point, hits.normal) > 0)
+        at = at[self.caster.visible(hits.point[at], hits.normal[at], self.camera.centre)]
+        of, part = bilinear_shares(xy[at], self.camera.lens.size)
+        return Glimpses(np.repeat(pixel[at], 4), of.ravel(), (part * share[at, None]).astype(np.float32).ravel())

@@ -1,0 +1,88 @@
+"""Which surface a ray meets, and where: Open3D finds the surface, the surface itself the exact point."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import libusb_package
+import numpy as np
+from numpy.typing import NDArray
+
+# Open3D's wheel wants a libusb from the system; this wheel's serves as well, once it is loaded for all to see.
+ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+import open3d as o3d  # noqa: E402
+
+from sim_backend.kernels import meet  # noqa: E402
+from sim_backend.surfaces import Array, Surface  # noqa: E402
+
+CLEARANCE_MM = 0.01
+"""How far above its surface a ray starts, so that it does not meet that very surface through rounding."""
+
+MISS = -1
+"""Surface number of a ray that meets nothing."""
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Where rays met a scene.
+
+    Parameters
+    ----------
+    surface
+        (n,) int16 number of the surface, `MISS` for none.
+    point
+        (n, 3) mm, NaN for none.
+    normal
+        (n, 3) unit normal on the side the ray came from, NaN for none.
+    """
+
+    surface: NDArray[np.int16]
+    point: Array
+    normal: Array
+
+
+class RayCaster:
+    """Rays against the surfaces of a scene."""
+
+    def __init__(self, surfaces: Sequence[Surface]) -> None:
+        self.surfaces = tuple(surfaces)
+        self._scene = o3d.t.geometry.RaycastingScene()
+        for surface in surfaces:
+            vertices, triangles = surface.mesh
+            self._scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(triangles))
+        self._shapes = np.array([surface.shape for surface in surfaces])
+        self.materials = np.array(
+            [(m.diffuse, m.specular, m.concentration) for m in (surface.material for surface in surfaces)]
+        )
+        """(surfaces, 3) diffuse share, specular share, concentration of the lobe."""
+
+    def first_hits(self, origin: Array, direction: Array) -> Hits:
+        """What rays meet first.
+
+        Parameters
+        ----------
+        origin
+            (3,) or (n, 3) mm.
+        direction
+            (n, 3), any length.
+        """
+        cast = self._scene.cast_rays(_rays(origin, direction))
+        # Open3D's number for "none" is the largest uint32, which becomes -1.
+        surface = cast["geometry_ids"].numpy().astype(np.int16)
+        return Hits(surface, *meet(self._shapes, surface, np.broadcast_to(origin, direction.shape), direction))
+
+    def visible(self, point: Array, normal: Array, target: Array) -> NDArray[np.bool_]:
+        """Whether nothing stands between points (n, 3), seen from the side of their normals, and ``target`` (3,)."""
+        start = point + CLEARANCE_MM * normal
+        hidden = self._scene.test_occlusions(_rays(start, target - start), tnear=0.0, tfar=1.0)
+        return ~np.asarray(hidden.numpy(), bool)
+
+
+def _rays(origin: Array, direction: Array) -> Any:
+    rays = np.empty((len(direction), 6), np.float32)
+    rays[:, :3] = origin
+    rays[:, 3:] = direction
+    return o3d.core.Tensor.from_numpy(rays)

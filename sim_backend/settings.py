@@ -1,0 +1,155 @@
+"""What an operator can set of a simulated bench: the ``bench:`` section of a configuration with ``kind: simulated``.
+
+Importing this file is cheap; all that computes is imported where it is needed.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from sim_backend.scenes import MirrorScene, Scene
+
+if TYPE_CHECKING:
+    from scanner.rig import Lens, Rig
+
+_Count = Annotated[int, Field(ge=0)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class _Picture(_Section):
+    """A lens and the picture behind or before it."""
+
+    width_px: int = Field(1024, ge=16, le=16384, description="Width of the picture, px.")
+    height_px: int = Field(768, ge=16, le=16384, description="Height of the picture, px.")
+    field_of_view_deg: float = Field(28.7, gt=1, lt=120, description="Horizontal field of view without distortion, °.")
+    distortion_k1: float = Field(
+        0.0, ge=-0.3, le=0.3, description="First radial distortion term k1 of OpenCV's lens model; 0 is a perfect lens."
+    )
+
+    def lens(self) -> Lens:
+        """The same as a camera model, the principal point in the middle."""
+        from scanner.rig import Lens
+
+        focal = self.width_px / 2 / math.tan(math.radians(self.field_of_view_deg / 2))
+        matrix = np.array([[focal, 0, (self.width_px - 1) / 2], [0, focal, (self.height_px - 1) / 2], [0, 0, 1]])
+        return Lens(matrix, np.array([self.distortion_k1, 0.0, 0.0, 0.0, 0.0]), (self.width_px, self.height_px))
+
+
+class CameraSettings(_Picture):
+    """The simulated camera."""
+
+    exposure_us: float = Field(16_667.0, gt=0, le=10_000_000, description="Exposure time, µs; grey values follow it.")
+    white_dn: float = Field(
+        182.0,
+        gt=0,
+        description="Sensitivity: grey value (8-bit scale) of a matt surface of reflectance 0.8 that faces the white"
+        " projector at the convergence distance, exposed for 16 667 µs.",
+    )
+    ambient_dn: float = Field(
+        2.0, ge=0, description="What room light adds to every pixel in 16 667 µs, grey value of the 8-bit scale."
+    )
+    blur_px: float = Field(0.5, ge=0, le=20, description="Standard deviation of the camera's Gaussian blur, camera px.")
+    bits: Literal[8, 10, 12] = Field(8, description="Bits of a grey value.")
+    read_noise_dn: float = Field(
+        1.5,
+        ge=0,
+        description="Standard deviation of a grey value in the dark, quantisation included, DN of the 8-bit scale.",
+    )
+    electrons_per_dn: float | None = Field(
+        None, gt=0, description="Electrons per grey level of the 8-bit scale, for shot noise; leave out for none."
+    )
+    readout_s: float = Field(0.005, ge=0, le=10, description="From the end of an exposure until its frame is there, s.")
+
+
+class ProjectorSettings(_Picture):
+    """The simulated projector."""
+
+    width_px: int = Field(1280, ge=16, le=16384, description="Width of the picture, px.")
+    height_px: int = Field(800, ge=16, le=16384, description="Height of the picture, px.")
+    field_of_view_deg: float = Field(35.5, gt=1, lt=120, description="Horizontal field of view without distortion, °.")
+    gamma: float = Field(
+        1.0, ge=0.2, le=5, description="Light follows (grey/255)^gamma; 1 is a projector with linear response."
+    )
+    blur_px: float = Field(
+        0.5, ge=0, le=20, description="Standard deviation of the projector's defocus beyond a pixel's own spot, px."
+    )
+    refresh_hz: float = Field(60.0, gt=0, le=10_000, description="Pictures per second.")
+    latency_s: float = Field(
+        0.035, ge=0, le=10, description="From the hand-over of a picture until it can appear at the next refresh, s."
+    )
+
+
+class TransportSettings(_Section):
+    """How finely light is traced."""
+
+    supersample: int = Field(3, ge=1, le=8, description="Camera rays per pixel along each axis.")
+    photons: int = Field(
+        3_000_000, ge=1000, le=100_000_000, description="Light paths traced from the projector for each kind of bounce."
+    )
+    specular_bounces: int = Field(3, ge=0, le=8, description="Mirror-like reflections that are followed.")
+    diffuse_bounces: int = Field(2, ge=0, le=8, description="Reflections followed where one of them is diffuse.")
+
+
+class FaultSettings(_Section):
+    """Faults to provoke, each a list of exposures counted from 0 since the bench was opened."""
+
+    repeat_frame_at: tuple[_Count, ...] = Field((), description="The camera hands out its former frame once more.")
+    stale_at: tuple[_Count, ...] = Field((), description="The projector still shows the picture before.")
+    drop_at: tuple[_Count, ...] = Field((), description="The frame never arrives.")
+    lose_camera_at: _Count | None = Field(None, description="The camera is unplugged at this exposure.")
+
+
+class SimulatedSettings(_Section):
+    """A bench that is not there: a scene, a camera and a projector that look at it, and how they fail."""
+
+    scene: Scene = Field(MirrorScene(), description="What stands in front of the bench.")
+    camera: CameraSettings = Field(CameraSettings(), description="The camera.")
+    projector: ProjectorSettings = Field(ProjectorSettings(), description="The projector.")
+    baseline_mm: float = Field(
+        180.0, gt=0, le=10_000, description="Distance of the projector to the camera's left, mm."
+    )
+    convergence_mm: float = Field(
+        600.0,
+        gt=0,
+        le=100_000,
+        description="Where the projector's axis crosses the camera's: distance from the camera, mm.",
+    )
+    seed: int = Field(0, ge=0, description="Seed of the camera noise: the same seed gives the same frames.")
+    settle_s: float | None = Field(
+        None,
+        ge=0,
+        le=60,
+        description="From showing a picture to the trigger, s; left out, the latency and one refresh, which suffice.",
+    )
+    transport: TransportSettings = Field(TransportSettings(), description="How finely light is traced.")
+    faults: FaultSettings = Field(FaultSettings(), description="Faults to provoke.")
+    real_time: bool = Field(False, description="Let simulated time really pass.")
+    cache_dir: Path | None = Field(
+        None,
+        description="Where computed light transport is kept; left out, the environment's MFS_SCANNER_CACHE or the"
+        " user's cache folder.",
+    )
+    cache_limit_mb: int = Field(
+        4000, ge=0, description="Size above which the oldest cached transports are deleted, MB."
+    )
+
+    def rig(self) -> Rig:
+        """The rig as it truly stands: the projector left of the camera, turned in about the vertical."""
+        from scanner.rig import Rig
+
+        centre = np.array([-self.baseline_mm, 0.0, 0.0])
+        z = np.array([0.0, 0.0, self.convergence_mm]) - centre
+        z /= np.linalg.norm(z)
+        y = np.array([0.0, 1.0, 0.0])
+        rotation = np.stack((np.cross(y, z), y, z))
+        return Rig(
+            self.camera.lens(), self.projector.lens(), rotation, -rotation @ centre, {"source": "simulated bench"}
+        )

@@ -1,0 +1,118 @@
+"""A bench for tests whose truth is an array: every pixel sees one or two given places of the projector's picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates, spline_filter
+
+from drivers import FrameFormat, FrameStamp, NoiseModel
+
+
+class CountingClock:
+    """Time that passes only when somebody sleeps."""
+
+    def __init__(self) -> None:
+        self.time = 0.0
+
+    def now(self) -> float:
+        return self.time
+
+    def sleep(self, seconds: float) -> None:
+        self.time += seconds
+
+
+@dataclass
+class ArrayBench:
+    """Pixel = ambient + gain·(P(x, y) + α·P(x', y')) + noise, P the picture between its pixels.
+
+    ``on_expose(number, index)`` may raise, or return the index of the picture that is really exposed.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    alpha: np.ndarray
+    x_bounce: np.ndarray
+    y_bounce: np.ndarray
+    size: tuple[int, int] = (320, 200)
+    gain: float = 0.6
+    ambient: float = 4.0
+    sigma: float = 1.5
+    seed: int = 0
+    rig: Any = None
+    on_expose: Any = None
+    name: str = "array"
+    simulated: bool = True
+    clock: CountingClock = field(default_factory=CountingClock)
+    exposures: int = 0
+    dark: bool = True
+    darkened: int = 0
+
+    def __post_init__(self) -> None:
+        self._rng = np.random.default_rng(self.seed)
+        self._pictures: list[np.ndarray] = []
+
+    @property
+    def projector_size(self) -> tuple[int, int]:
+        return self.size
+
+    @property
+    def frame_format(self) -> FrameFormat:
+        return FrameFormat(self.x.shape[1], self.x.shape[0], 8)
+
+    @property
+    def noise(self) -> NoiseModel | None:
+        return NoiseModel(float(np.sqrt(self.sigma**2 + 1 / 12)))
+
+    def prepare(self, patterns) -> None:
+        self._pictures = [p.astype(np.float32) for p in patterns]
+
+    def light(self, picture: np.ndarray) -> np.ndarray:
+        spline = spline_filter(picture, order=3, mode="nearest")
+
+        def at(x, y):
+            return map_coordinates(spline, [y, x], order=3, mode="nearest", prefilter=False)
+
+        return self.ambient + self.gain * (at(self.x, self.y) + self.alpha * at(self.x_bounce, self.y_bounce))
+
+    def expose(self, index, out) -> FrameStamp:
+        number, self.exposures, self.dark = self.exposures, self.exposures + 1, False
+        shown = index
+        if self.on_expose is not None:
+            answer = self.on_expose(number, index)
+            shown = index if answer is None else answer
+        ideal = self.light(self._pictures[shown])
+        out[:] = np.clip(np.rint(ideal + self._rng.normal(0, self.sigma, ideal.shape)), 0, 255)
+        self.clock.sleep(0.05)
+        return FrameStamp(number, self.clock.now(), self.clock.now(), self.clock.now())
+
+    def darken(self) -> None:
+        self.dark = True
+        self.darkened += 1
+
+    def describe(self) -> dict[str, Any]:
+        return {"name": self.name}
+
+
+@pytest.fixture
+def array_bench():
+    """A slanted surface of 120 × 160 pixels; a rectangle of it also sees a mirror image, shifted by 130 px."""
+
+    def make(**changes: Any) -> ArrayBench:
+        rows, columns = np.mgrid[0:120, 0:160].astype(float)
+        x, y = 20.3 + 1.1 * columns + 0.05 * rows, 15.7 + 1.2 * rows
+        alpha = np.zeros_like(x)
+        alpha[30:90, 20:70] = 0.5
+        values: dict[str, Any] = {
+            "x": x,
+            "y": y,
+            "alpha": alpha,
+            "x_bounce": 290 - 0.9 * (x - 40),
+            "y_bounce": y + 11,
+        }
+        return ArrayBench(**(values | changes))
+
+    return make

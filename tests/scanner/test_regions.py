@@ -1,0 +1,87 @@
+"""What round two lights."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scanner.patterns import Plan, phase_steps
+from scanner.regions import inside, literal_mask, sound_mask
+
+SIZE = (200, 120)
+
+
+def patch(x0, x1, y0, y1, pitch=1.4):
+    """Coordinates of a camera that samples the projector every ``pitch`` px."""
+    x, y = np.meshgrid(np.arange(x0, x1, pitch), np.arange(y0, y1, pitch))
+    return x.ravel().astype(np.float32), y.ravel().astype(np.float32)
+
+
+def test_sound_lights_the_direct_coordinates_and_a_margin_and_nothing_else():
+    x, y = patch(50, 90, 30, 70)
+    lit = sound_mask(x, y, SIZE, 6)
+    assert lit[30:70, 50:90].all()
+    assert lit[50, 45]
+    assert not lit[:, :40].any()
+    assert not lit[:, 102:].any()
+    assert not lit[:20].any()
+
+
+def test_a_single_wrong_coordinate_lights_nothing():
+    x, y = patch(50, 90, 30, 70)
+    lit = sound_mask(np.append(x, 150).astype(np.float32), np.append(y, 100).astype(np.float32), SIZE, 6)
+    assert not lit[90:, 140:].any()
+
+
+def test_the_margin_does_not_grow_onto_emitters():
+    x, y = patch(50, 90, 30, 70)
+    lit = sound_mask(x, y, SIZE, 10, patch(93, 130, 30, 70))
+    assert lit[50, 88]
+    assert not lit[50, 95:].any()
+
+
+def test_one_axis_lights_whole_columns_or_rows():
+    x, _ = patch(50, 90, 30, 70)
+    nothing = np.full(x.size, np.nan, np.float32)
+    columns = sound_mask(x, nothing, SIZE, 0)
+    assert columns[:, 52:88].all()
+    assert not columns[:, :48].any()
+    rows = sound_mask(nothing, x, SIZE, 0)
+    assert rows[52:88].all()
+    assert not rows[:48].any()
+
+
+def test_literal_leaves_lit_what_no_camera_pixel_maps_to():
+    x, y = patch(0, 100, 0, 120)
+    lit = literal_mask(x, y, SIZE)
+    assert not lit[5:115, 5:95].any()
+    assert lit[:, 110:].all()
+
+
+def test_touching_the_border_of_the_picture_is_no_loss():
+    x, y = patch(0, 40, 0, 40)
+    lit = sound_mask(x, y, SIZE, 0)
+    assert lit[0, 0]
+    assert inside(lit, np.array([0.0], np.float32), np.array([0.0], np.float32), 2).all()
+
+
+def test_inside_keeps_clear_of_the_cut():
+    lit = np.zeros((120, 200), bool)
+    lit[20:60, 20:60] = True
+    x = np.array([40, 21, 59, 100, np.nan], np.float32)
+    y = np.array([40, 40, 40, 40, 40], np.float32)
+    assert inside(lit, x, y, 3).tolist() == [True, False, False, False, False]
+
+
+def test_masked_plan_is_black_where_not_lit_and_survives_json():
+    mask = np.zeros((120, 200), bool)
+    mask[10:50, 30:70] = True
+    plan = Plan(SIZE, (phase_steps("x", 1 / 16, 4), phase_steps("y", 1 / 20, 4)), mask=mask)
+    for sequence in range(2):
+        pictures = plan.render(sequence)
+        free = Plan(SIZE, plan.sequences).render(sequence)
+        for lit, whole in zip(pictures, free, strict=True):
+            assert (lit[~mask] == 0).all()
+            assert (lit[mask] == whole[mask]).all()
+    again = Plan.from_json(plan.to_json())
+    assert again == plan
+    assert (again.mask == mask).all()
