@@ -142,7 +142,7 @@ def separate_two_paths(
 
     def separate(start: int) -> None:
         _separate_block(
-            phasors, sigma, comb.gain, comb.weight, comb.xi, *comb.invariance, comb.carrier, comb.step_rad, comb.turn,
+            phasors, sigma, comb.gain, comb.weight, comb.xi, *comb.pencil, comb.carrier, comb.step_rad, comb.turn,
             comb.low, comb.high, found, start, min(start + _BLOCK, pixels),
         )  # fmt: skip
 
@@ -170,8 +170,8 @@ class _Comb:
 
     ``gain`` (T,) m_t; ``weight`` (T,) m_t²; ``xi`` (T,) ξ_t about the weighted mean frequency; ``carrier`` 2πf_c,
     rad/px; ``step_rad`` Δf/f_c, so that v·step_rad is the angle of a pole; ``turn`` the v after which all fringes
-    coincide again, 0 where that is not 1/Δf; ``low`` and ``high`` the range of v; ``invariance`` the matrices of
-    `_real_invariance`.
+    coincide again, 0 where that is not 1/Δf; ``low`` and ``high`` the range of v; ``pencil`` the matrices of
+    `_unitary_esprit`.
     """
 
     gain: Reals
@@ -182,7 +182,7 @@ class _Comb:
     turn: float
     low: float
     high: float
-    invariance: tuple[Reals, Reals]
+    pencil: tuple[Phasors, Reals, Reals]
 
 
 def _prepare(
@@ -232,15 +232,18 @@ def _prepare(
             turn=carrier / spacing if coincide else 0.0,
             low=-0.5 * carrier,
             high=(extent - 0.5) * carrier,
-            invariance=_real_invariance(f.size // 2 + 1),
+            pencil=_unitary_esprit(f.size // 2 + 1),
         ),
     )
 
 
-def _real_invariance(m: int) -> tuple[Reals, Reals]:
-    """Real shift-invariance matrices K₁, K₂ (m - 1, m) of unitary ESPRIT: K₁ E tan(μ/2) = K₂ E for a pole e^{iμ}."""
+def _unitary_esprit(m: int) -> tuple[Phasors, Reals, Reals]:
+    """Transform Qᴴ (m, m) that makes a forward-backward covariance real, and the matrices K₁, K₂ (m - 1, m) for poles.
 
-    def unitary(size: int) -> Phasors:
+    For the signal subspace E and a pole e^{iμ}: K₁ E tan(μ/2) = K₂ E.
+    """
+
+    def transform(size: int) -> Phasors:
         half = size // 2
         eye, flip = np.eye(half), np.eye(half)[::-1]
         q = np.zeros((size, size), np.complex128)
@@ -248,10 +251,16 @@ def _real_invariance(m: int) -> tuple[Reals, Reals]:
         q[size - half :, :half], q[size - half :, size - half :] = flip, -1j * flip
         if size % 2:
             q[half, half] = math.sqrt(2)
-        return q / math.sqrt(2)
+        return np.ascontiguousarray(q.conj().T) / math.sqrt(2)
 
-    shifted = unitary(m - 1).conj().T @ np.eye(m)[1:] @ unitary(m)
-    return np.ascontiguousarray(shifted.real), np.ascontiguousarray(shifted.imag)
+    unitary = transform(m)
+    shifted = transform(m - 1) @ np.eye(m)[1:] @ unitary.conj().T
+    return unitary, np.ascontiguousarray(shifted.real), np.ascontiguousarray(shifted.imag)
+
+
+@_compiled  # pragma: no cover
+def _turn(angle: float) -> complex:
+    return complex(math.cos(angle), math.sin(angle))
 
 
 @_compiled  # pragma: no cover
@@ -262,8 +271,7 @@ def _float_fit(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float) -> Any:
     half the power.
     """
     dx = xi[1] - xi[0]
-    e1, turn1 = complex(math.cos(xi[0] * v1), math.sin(xi[0] * v1)), complex(math.cos(dx * v1), math.sin(dx * v1))
-    e2, turn2 = complex(math.cos(xi[0] * v2), math.sin(xi[0] * v2)), complex(math.cos(dx * v2), math.sin(dx * v2))
+    e1, turn1, e2, turn2 = _turn(xi[0] * v1), _turn(dx * v1), _turn(xi[0] * v2), _turn(dx * v2)
     c1 = c2 = f1 = f2 = m0 = m1 = m2 = 0j
     s0 = s2 = 0.0
     for t in range(y.size):
@@ -306,8 +314,7 @@ def _fixed_fit(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float) -> Any:
     (a₁, a₂).
     """
     dx, x = xi[1] - xi[0], 1 + xi[0]
-    e1, turn1 = complex(math.cos(x * v1), math.sin(x * v1)), complex(math.cos(dx * v1), math.sin(dx * v1))
-    e2, turn2 = complex(math.cos(x * v2), math.sin(x * v2)), complex(math.cos(dx * v2), math.sin(dx * v2))
+    e1, turn1, e2, turn2 = _turn(x * v1), _turn(dx * v1), _turn(x * v2), _turn(dx * v2)
     c1 = c2 = f1 = f2 = m0 = m1 = m2 = s0 = s2 = 0.0
     for t in range(y.size):
         q1, q2, p = e1.conjugate() * y[t], e2.conjugate() * y[t], e1.conjugate() * e2
@@ -389,44 +396,33 @@ def _refine_fixed(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float, toleran
 
 
 @_compiled  # pragma: no cover
-def _pencil(y: Phasors, k1: Reals, k2: Reals, c: Reals, c2: Reals, e: Reals) -> Any:
+def _pencil(y: Phasors, unitary: Phasors, k1: Reals, k2: Reals, c: Reals, c2: Reals, e: Reals) -> Any:
     """Angles (rad per Δf) of the two strongest poles by unitary ESPRIT; NaN where they do not lie apart on the circle.
 
     ``c``, ``c2`` (m, m) and ``e`` (4, m) are workspace.
     """
-    m = k1.shape[1]
-    half = m // 2
+    m = unitary.shape[0]
     for a in range(m):
         for b in range(m):
             c[a, b] = 0.0
-    # Forward-backward covariance of the windows of m phasors, made real by the unitary transform.
+    # Forward-backward covariance of the windows of m phasors, which the unitary transform makes real.
     for j in range(y.size - m + 1):
-        for i in range(half):
-            plus, minus = y[j + i] + y[j + m - 1 - i], y[j + i] - y[j + m - 1 - i]
-            e[0, i], e[1, i] = plus.real, plus.imag
-            e[0, m - half + i], e[1, m - half + i] = minus.imag, -minus.real
-        if m % 2:
-            e[0, half], e[1, half] = math.sqrt(2) * y[j + half].real, math.sqrt(2) * y[j + half].imag
+        for a in range(m):
+            s = 0j
+            for b in range(m):
+                s += unitary[a, b] * y[j + b]
+            e[0, a], e[1, a] = s.real, s.imag
         for a in range(m):
             for b in range(m):
                 c[a, b] += e[0, a] * e[0, b] + e[1, a] * e[1, b]
-    # Signal subspace: orthogonal iteration on the square, from its largest column and the one that differs most.
-    first = 0
     for a in range(m):
+        e[0, a], e[1, a] = c[0, a], c[m - 1, a]
         for b in range(m):
-            s1 = 0.0
+            dot = 0.0
             for k in range(m):
-                s1 += c[a, k] * c[k, b]
-            c2[a, b] = s1
-        if c2[a, a] > c2[first, first]:
-            first = a
-    second, most = 0, -1.0
-    for a in range(m):
-        left = c2[a, a] - c2[a, first] ** 2 / max(c2[first, first], _TINY)
-        if a != first and left > most:
-            second, most = a, left
-    for a in range(m):
-        e[0, a], e[1, a] = c[first, a], c[second, a]
+                dot += c[a, k] * c[k, b]
+            c2[a, b] = dot
+    # Signal subspace: orthogonal iteration on the square of the covariance.
     for _ in range(5):
         s1 = s2 = dot = 0.0
         for a in range(m):
@@ -437,11 +433,11 @@ def _pencil(y: Phasors, k1: Reals, k2: Reals, c: Reals, c2: Reals, e: Reals) -> 
             e[2, a], e[3, a] = n1, n2
             s1 += n1 * n1
             dot += n1 * n2
-        dot /= max(s1, _TINY)
+        s1 = 1 / max(s1, _TINY)
         for a in range(m):
-            e[3, a] -= dot * e[2, a]
-            s2 += e[3, a] ** 2
-        s1, s2 = 1 / math.sqrt(max(s1, _TINY)), 1 / math.sqrt(max(s2, _TINY))
+            e[3, a] -= s1 * dot * e[2, a]
+            s2 += e[3, a] * e[3, a]
+        s1, s2 = math.sqrt(s1), 1 / math.sqrt(max(s2, _TINY))
         for a in range(m):
             e[0, a], e[1, a] = s1 * e[2, a], s2 * e[3, a]
     # Least squares of K₁ E Ω = K₂ E; the eigenvalues of the 2 x 2 matrix Ω are tan(μ/2).
@@ -479,7 +475,7 @@ def _strongest(y: Phasors, g: Reals, xi: Reals, low: float, high: float, step: f
         s0 += g[t]
     for k in range(int((high - low) / step) + 1):
         v = low + k * step
-        e, turn = complex(math.cos(xi[0] * v), -math.sin(xi[0] * v)), complex(math.cos(dx * v), -math.sin(dx * v))
+        e, turn = _turn(-xi[0] * v), _turn(-dx * v)
         c = 0j
         for t in range(y.size):
             c += g[t] * (e * y[t])
@@ -575,8 +571,8 @@ def _try_orders(
 
 @_compiled  # pragma: no cover
 def _separate_block(
-    z: NDArray[np.complex64], sigma: Reals, gain: Reals, g: Reals, xi: Reals, k1: Reals, k2: Reals, carrier: float,
-    step_rad: float, turn: float, low: float, high: float, found: Floats, start: int, stop: int,
+    z: NDArray[np.complex64], sigma: Reals, gain: Reals, g: Reals, xi: Reals, unitary: Phasors, k1: Reals, k2: Reals,
+    carrier: float, step_rad: float, turn: float, low: float, high: float, found: Floats, start: int, stop: int,
 ) -> None:  # fmt: skip
     """Two paths of the pixels start..stop; rows of ``found`` in the order of `_two_paths`."""
     count, m = z.shape[0], k1.shape[1]
@@ -584,8 +580,9 @@ def _separate_block(
     covariance, square, basis = np.empty((m, m)), np.empty((m, m)), np.empty((4, m))
     seeds, best = np.empty((_REFINED, 3)), np.empty(8)
     dof = 2 * count - 4
-    # The width of a path in the spectrum of the comb, 1/(TΔf), as a phase of the carrier.
-    resolution = 2 * math.pi / (count * step_rad)
+    # 1/Δf and the width of a path in the spectrum of the comb, 1/(TΔf), as phases of the carrier.
+    period = 2 * math.pi / step_rad
+    resolution = period / count
     middle = 0.5 * (low + high)
     for p in range(start, stop):
         variance = sigma[p] ** 2
@@ -596,8 +593,10 @@ def _separate_block(
         if not (0 < total < math.inf and 0 < variance < math.inf):
             continue
         best[0], best[1], best[2], best[4], best[5] = math.inf, math.inf, math.nan, 1.0, 1.0
-        pole1, pole2 = _pencil(y, k1, k2, covariance, square, basis)
-        v1, v2 = pole1 / step_rad, pole2 / step_rad
+        pole1, pole2 = _pencil(y, unitary, k1, k2, covariance, square, basis)
+        # Of the places that a pole may stand for, the one nearest to the middle of the picture.
+        v1 = middle + period * ((pole1 / (2 * math.pi) - middle / period + 0.5) % 1 - 0.5)
+        v2 = middle + period * ((pole2 / (2 * math.pi) - middle / period + 0.5) % 1 - 0.5)
         if not abs(v1 - v2) > 0.1 * resolution:
             # The poles have run together: take the likeliest of some distances about them.
             centre, most = (v1 if math.isnan(v2) else 0.5 * (v1 + v2)), -1.0
@@ -610,11 +609,8 @@ def _separate_block(
             if attempt == 1:
                 v1, r = _strongest(y, g, xi, low, high, resolution / 8)
                 for t in range(count):
-                    left[t] = y[t] - r * complex(math.cos(xi[t] * v1), math.sin(xi[t] * v1))
+                    left[t] = y[t] - r * _turn(xi[t] * v1)
                 v2, _ = _strongest(left, g, xi, low, high, resolution / 8)
-            period = 2 * math.pi / step_rad
-            v1 += period * round((middle - v1) / period)
-            v2 += period * round((middle - v2) / period)
             solution = _refine_float(y, g, xi, v1, v2, 0.1 * resolution)
             _try_orders(y, g, xi, total, variance, solution, turn, low, high, seeds, best)
             chi2 = best[0] / variance - 2 * math.log(best[4] + best[5])
@@ -626,7 +622,7 @@ def _separate_block(
                 found[2 + k, p] = best[4 + k]
                 found[4 + k, p] = sigma[p] * math.sqrt(best[6]) / (best[4 + k] * carrier)
             found[6, p] = sigma[p] * math.sqrt(best[7])
-            found[7, p] = chi2
+            found[7, p] = max(chi2, 0.0)
             found[8, p] = (best[1] - best[0]) / variance
 
 
@@ -666,7 +662,7 @@ def separate_two_paths_twin(
         off = model(p)[0] - z
         return np.concatenate([off.real, off.imag]) / sigma_z
 
-    def slopes_of(p: Reals) -> Reals:
+    def jacobian_of(p: Reals) -> Reals:
         slopes = model(p)[1]
         return np.concatenate([slopes.real, slopes.imag]) / sigma_z
 
@@ -680,7 +676,7 @@ def separate_two_paths_twin(
         fit = least_squares(
             misfit,
             start,
-            slopes_of,
+            jacobian_of,
             bounds=([0, -np.inf, 0, -np.inf], np.inf),
             x_scale=[1.0, 0.1, 1.0, 0.1],
             ftol=1e-10,
@@ -693,7 +689,7 @@ def separate_two_paths_twin(
     solutions.sort(key=lambda solution: solution[0])
     score, chi2, p = solutions[0]
     others = (s[0] - score for s in solutions if np.abs(s[2] - p)[1::2].max() > 0.1 / centre)
-    jacobian = slopes_of(p)
+    jacobian = jacobian_of(p)
     sigma = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
     column = [p[1], p[3], p[0], p[2], sigma[1], sigma[3], sigma[0], chi2, next(others, math.inf)]
     return _two_paths(np.array(column, np.float32)[:, None], f.size)
@@ -720,7 +716,7 @@ class DirectPath:
     ix, iy
         (P,) index 0 or 1 into the two paths of the first and of the second axis; equal where there is one axis.
     confidence
-        (P,) log-likelihood ratio of the choice against the next best; NaN where no path is finite.
+        (P,) log-likelihood ratio of the choice against the next best; NaN where an axis has no finite path.
     """
 
     ix: NDArray[np.intp]
@@ -770,7 +766,8 @@ def choose_direct(
         axes.append((y, near_y, (None, slice(None))))
     for paths, near, spread in axes:
         # Where the amplitudes differ by no more than their noise, their order says nothing.
-        sure = ndtr((paths.amplitude[0] - paths.amplitude[1]) / (math.sqrt(2) * paths.sigma_amplitude))
+        lead = paths.amplitude[0] - paths.amplitude[1]
+        sure = np.nan_to_num(ndtr(lead / (math.sqrt(2) * paths.sigma_amplitude)), nan=0.5)
         larger = _LARGER_IS_DIRECT * sure + (1 - _LARGER_IS_DIRECT) * (1 - sure)
         score += np.log([larger, 1 - larger])[spread] / len(axes)
         score[np.broadcast_to(~np.isfinite(paths.u)[spread], shape)] = -np.inf

@@ -10,6 +10,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+_CELL_PX = 8
+"""Side of the cells in which it is counted who lights whom, projector px."""
+
+_HARM = 0.02
+"""A surface that lights more than this share of another's pixels must not be lit together with it."""
+
+_SMALLEST_SURFACE = 12
+"""Fewer pixels than this are strays of the separation, not a surface."""
+
+_CONTINUOUS_PX = 4.0
+"""On one surface neighbouring camera pixels see projector pixels no farther apart than this."""
+
 _DENSITY = 3
 """A projector pixel is believed when at least this many coordinates fall on it and its 8 neighbours."""
 
@@ -47,6 +59,114 @@ def sound_mask(
         source = _close(_believed(_splat(*emitters, size)))
         grown &= core | ~source
     return np.asarray(grown)
+
+
+def lit_together(
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    bounce_x: NDArray[np.float32],
+    bounce_y: NDArray[np.float32],
+) -> NDArray[np.bool_]:
+    """Choose surfaces of the region that can be lit at once because none of them lights another.
+
+    A mirror in view shows the camera the lit board a second time, where the projector lights it through the mirror: both
+    places are detected, and each is the other's emitter. The largest surface goes first; whatever would light one that
+    is chosen already, or be lit by it, stays dark.
+
+    Parameters
+    ----------
+    x, y
+        (H, W) direct projector coordinates of the detected pixels, px, NaN elsewhere.
+    bounce_x, bounce_y
+        (H, W) where their bounces come from.
+
+    Returns
+    -------
+    NDArray
+        (H, W) bool, pixels of the chosen surfaces.
+    """
+    known = np.isfinite(x) & np.isfinite(y)
+    broken = ~known
+    for axis in (0, 1):
+        step = np.abs(np.diff(x, axis=axis)) + np.abs(np.diff(y, axis=axis))
+        jump = step > _CONTINUOUS_PX
+        broken[(slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))] |= jump
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((~broken).astype(np.uint8), connectivity=4)
+    by_size = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")
+    chosen = np.zeros(count, bool)
+    lit: set[int] = set()
+    emitting: dict[int, float] = {}
+    for label in by_size[stats[by_size, cv2.CC_STAT_AREA] >= _SMALLEST_SURFACE]:
+        left, top, width, height, area = stats[label]
+        window = (slice(top, top + height), slice(left, left + width))
+        mine = labels[window] == label
+        places = set(np.unique(_cells(x[window][mine], y[window][mine])).tolist())
+        sources, counts = np.unique(_cells(bounce_x[window][mine], bounce_y[window][mine]), return_counts=True)
+        harmed = sum(n for cell, n in zip(sources.tolist(), counts.tolist(), strict=True) if cell in lit)
+        harming = sum(emitting.get(cell, 0.0) for cell in places)
+        if harmed > _HARM * area or harming > _HARM:
+            continue
+        chosen[label] = True
+        lit |= places
+        for cell, n in zip(sources.tolist(), counts.tolist(), strict=True):
+            emitting[cell] = emitting.get(cell, 0.0) + n / area
+    return np.asarray(chosen[labels])
+
+
+def _cells(x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Number of the cell that each coordinate lies in, -1 for NaN."""
+    cells = np.full(x.shape, -1, np.int64)
+    known = np.isfinite(x) & np.isfinite(y)
+    cells[known] = np.floor(y[known] / _CELL_PX).astype(np.int64) * 100_000 + np.floor(x[known] / _CELL_PX).astype(np.int64)
+    return cells
+
+
+def continued(
+    u: NDArray[np.float32], known: NDArray[np.bool_], wanted: NDArray[np.bool_], reach_px: float = 12.0
+) -> NDArray[np.float32]:
+    """Continue a coordinate from where it is known to ``wanted`` pixels nearby, by a local plane.
+
+    Parameters
+    ----------
+    u, known
+        (H, W) coordinate, px, and where it counts.
+    wanted
+        (H, W) pixels to be given one.
+    reach_px
+        Standard deviation of the Gaussian window in which the plane is fitted, camera px; three of them is the limit.
+
+    Returns
+    -------
+    NDArray
+        (P,) coordinates of the wanted pixels in row order, NaN where nothing is known within reach.
+    """
+    rows, columns = np.nonzero(wanted)
+    weight = known.astype(np.float32)
+    middle = float(u[known].mean()) if known.any() else 0.0
+    value = np.where(known, u - np.float32(middle), np.float32(0))
+    y, x = (g.astype(np.float32) / np.float32(reach_px) for g in np.mgrid[: u.shape[0], : u.shape[1]])
+
+    def moment(plane: NDArray[np.float32]) -> NDArray[np.float64]:
+        blurred = cv2.GaussianBlur(plane, (0, 0), reach_px, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(blurred, np.float64)[rows, columns]
+
+    w, wx, wy = moment(weight), moment(weight * x), moment(weight * y)
+    wxx, wxy, wyy = moment(weight * x * x), moment(weight * x * y), moment(weight * y * y)
+    wu, wux, wuy = moment(value), moment(value * x), moment(value * y)
+    # Normal equations about the pixel itself, a little ridge on the slopes for pixels with neighbours on one line.
+    px, py = x[rows, columns].astype(np.float64), y[rows, columns].astype(np.float64)
+    a = np.empty((rows.size, 3, 3))
+    a[:, 0, 0] = w
+    a[:, 0, 1] = a[:, 1, 0] = wx - px * w
+    a[:, 0, 2] = a[:, 2, 0] = wy - py * w
+    a[:, 1, 1] = wxx - 2 * px * wx + px * px * w + 1e-4 * w
+    a[:, 2, 2] = wyy - 2 * py * wy + py * py * w + 1e-4 * w
+    a[:, 1, 2] = a[:, 2, 1] = wxy - px * wy - py * wx + px * py * w
+    b = np.stack([wu, wux - px * wu, wuy - py * wu], axis=1)
+    near = w > 1e-3
+    found = np.full(rows.size, np.nan, np.float32)
+    found[near] = np.linalg.solve(a[near], b[near, :, None])[:, 0, 0] + middle
+    return found
 
 
 def literal_mask(x: NDArray[np.float32], y: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.bool_]:

@@ -18,8 +18,20 @@ from sim_backend.settings import SimulatedSettings
 from sim_backend.transport import Transport, trace
 
 _log = logging.getLogger(__name__)
-_VERSION = 1
-"""Raise it when tracing the same scene gives other matrices or the file's layout changes."""
+_SOURCES = (
+    "cache",
+    "camera_paths",
+    "columns",
+    "kernels",
+    "projector_paths",
+    "raycasting",
+    "reflection",
+    "scenes",
+    "surfaces",
+    "transport",
+    "viewpoint",
+)
+"""The modules that decide what tracing gives; their text is part of the content: no old result outlives them."""
 
 
 def transport_of(settings: SimulatedSettings) -> Transport:
@@ -53,8 +65,9 @@ def _folder(settings: SimulatedSettings) -> Path:
 
 
 def _content_hash(settings: SimulatedSettings) -> str:
+    here = Path(__file__).parent
     content = {
-        "version": _VERSION,
+        "sources": [hashlib.sha256((here / f"{name}.py").read_bytes()).hexdigest() for name in _SOURCES],
         "scene": settings.scene.model_dump(mode="json"),
         "rig": settings.rig().to_json(),
         "transport": settings.transport.model_dump(mode="json"),

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
-from typing import Self
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from sim_backend.columns import Columns
 from sim_backend.kernels import Floats, SparseRows, in_parallel, reflected_radiance, spread_spots
 from sim_backend.raycasting import CLEARANCE_MM, Hits, RayCaster
 from sim_backend.reflection import scatter_specular, unit
@@ -21,18 +20,8 @@ _MIRROR_LIKE_RAD = 0.02
 """Lobes up to this broad are followed from the camera; broader ones would need more rays than a pixel has."""
 
 
-class Joinable:
-    """A dataclass of arrays that belong together element by element."""
-
-    @classmethod
-    def joined(cls, parts: Iterable[Self]) -> Self:
-        """All parts in one, in their order."""
-        parts = list(parts)
-        return cls(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)))  # type: ignore[arg-type]
-
-
 @dataclass(frozen=True, eq=False)
-class View(Joinable):
+class View(Columns):
     """What the rays through the camera's pixel centres meet; arrays of the camera's (height, width).
 
     Parameters
@@ -55,7 +44,7 @@ class View(Joinable):
 
 
 @dataclass(frozen=True, eq=False)
-class Paths(Joinable):
+class Paths(Columns):
     """Light paths that end in camera pixels.
 
     Parameters
@@ -75,7 +64,7 @@ class Paths(Joinable):
 
 
 @dataclass(frozen=True, eq=False)
-class Glimpses(Joinable):
+class Glimpses(Columns):
     """What pixels see in a mirror.
 
     Parameters
@@ -124,14 +113,15 @@ def trace_camera(
     width, height = camera.lens.size
     rows = max(1, _RAYS_AT_ONCE // (width * supersample**2))
     tracer = _Tracer(caster, camera, projector, supersample, bounces)
-    blocks = list(in_parallel(lambda r: tracer.trace(r, min(r + rows, height)), range(0, height, rows)))
-    glimpses = Glimpses.joined(b[3] for b in blocks)
+    blocks = in_parallel(lambda r: tracer.trace(r, min(r + rows, height)), range(0, height, rows))
+    views, direct, by_mirror, seen_in_mirror = (list(parts) for parts in zip(*blocks, strict=True))
+    glimpses = Glimpses.joined(seen_in_mirror)
     pixels = width * height
     seen = sparse.csr_array((glimpses.share, (glimpses.pixel, glimpses.of)), shape=(pixels, pixels))
     return CameraPaths(
-        View.joined(b[0] for b in blocks),
-        SparseRows.stacked([b[1] for b in blocks]),
-        Paths.joined(b[2] for b in blocks),
+        View.joined(views),
+        SparseRows.stacked(direct),
+        Paths.joined(by_mirror),
         SparseRows.of(seen),
     )
 

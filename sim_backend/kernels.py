@@ -1,4 +1,4 @@
-"""Compiled loops of the light transport: sparse rows from light paths, and sparse rows times a picture."""
+"""Sparse matrices of light, and the compiled loops that fill them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -20,7 +21,7 @@ _Result = TypeVar("_Result")
 
 _CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 _POOL = ThreadPoolExecutor(_CORES, thread_name_prefix="light")
-_ROWS_AT_ONCE = 1 << 15
+_ROWS_AT_ONCE = 100_000
 SPOT_TAPS = 16
 """Projector pixels whose spots reach one place: 4 × 4."""
 
@@ -50,17 +51,19 @@ class SparseRows:
 
     def __matmul__(self, x: Floats) -> Floats:
         """The product with a vector (columns,) as (rows,) float32."""
-        x = np.ascontiguousarray(x, np.float32)
-        rows = self.start.size - 1
-        out = np.zeros(rows, np.float32)
-        if self.value.size:
-            blocks = range(0, rows, _ROWS_AT_ONCE)
-            for _ in in_parallel(
-                lambda r: _multiply(self.start, self.column, self.value, x, out, r, min(r + _ROWS_AT_ONCE, rows)),
-                blocks,
-            ):
-                pass
-        return out
+        return np.concatenate(list(in_parallel(lambda block: block @ x[: block.shape[1]], self._blocks)))
+
+    @cached_property
+    def _blocks(self) -> list[sparse.csr_array]:
+        """Views of some rows each, one for a core at a time."""
+        columns = int(self.column.max(initial=0)) + 1
+        blocks = []
+        for first in range(0, self.start.size - 1, _ROWS_AT_ONCE):
+            start = self.start[first : first + _ROWS_AT_ONCE + 1]
+            a, b = start[0], start[-1]
+            entries = self.value[a:b], self.column[a:b], (start - a).astype(np.int32)
+            blocks.append(sparse.csr_array(entries, shape=(start.size - 1, columns)))
+        return blocks
 
     @classmethod
     def of(cls, matrix: sparse.csr_array) -> SparseRows:
@@ -82,15 +85,6 @@ class SparseRows:
             value[at : at + block.value.size] = block.value
             at += block.value.size
         return cls(start, column, value)
-
-
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
-def _multiply(start, column, value, x, out, begin, end):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    for row in range(begin, end):
-        total = np.float32(0)
-        for k in range(start[row], start[row + 1]):
-            total += value[k] * x[column[k]]
-        out[row] = total
 
 
 def spread_spots(

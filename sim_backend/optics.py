@@ -67,7 +67,7 @@ class Optics:
         """(height, width) what leaves the projector, 0..1, as the mean over an exposure."""
         light = np.zeros(self.transport.projector_size[::-1], np.float32)
         for share, picture in shown:
-            light += np.float32(share) * self._response[picture]
+            light += cv2.LUT(picture, np.float32(share) * self._response)
         return self.projector_blurred(light)
 
     def projector_blurred(self, light: Floats) -> Floats:

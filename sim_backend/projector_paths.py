@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
-from typing import Self
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_backend.columns import Columns
 from sim_backend.raycasting import CLEARANCE_MM, MISS, RayCaster
 from sim_backend.reflection import scatter_diffuse, scatter_specular, unit
-from sim_backend.surfaces import Array
+from sim_backend.surfaces import Array, Material
 from sim_backend.viewpoint import Viewpoint
 
 
 @dataclass(frozen=True, eq=False)
-class Photons:
+class Photons(Columns):
     """Packets of light on a surface.
 
     Parameters
@@ -32,7 +32,9 @@ class Photons:
     surface
         (n,) number of the surface.
     lobe_mm
-        (n,) how far a lobe spread them since the last reflection, standard deviation in mm; 0 for perfect mirrors.
+        (n,) how far lobes have spread them, standard deviation in mm; 0 after perfect mirrors.
+    choice
+        (n, 2) numbers in 0..1 that choose the next direction.
     """
 
     u: Array
@@ -43,12 +45,12 @@ class Photons:
     direction: Array
     surface: NDArray[np.int16]
     lobe_mm: Array
-
-    def __getitem__(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> Self:
-        return type(self)(*(getattr(self, f.name)[chosen] for f in fields(self)))
+    choice: Array
 
 
-def emit(caster: RayCaster, projector: Viewpoint, uv: Array, flux: float, surface: int | None = None) -> Photons:
+def emit(
+    caster: RayCaster, projector: Viewpoint, uv: Array, flux: float, choice: Array, surface: int | None = None
+) -> Photons:
     """Photons of ``flux`` each from projector places ``uv`` (n, 2) where they first arrive.
 
     Those that meet nothing are left out, and with ``surface`` those that meet another one.
@@ -57,13 +59,19 @@ def emit(caster: RayCaster, projector: Viewpoint, uv: Array, flux: float, surfac
     hits = caster.first_hits(projector.centre, direction)
     n = len(uv)
     arrived = Photons(
-        uv[:, 0], uv[:, 1], np.full(n, flux), hits.point, hits.normal, direction, hits.surface, np.zeros(n)
+        uv[:, 0], uv[:, 1], np.full(n, flux), hits.point, hits.normal, direction, hits.surface, np.zeros(n), choice
     )
     return arrived[hits.surface != MISS if surface is None else hits.surface == surface]
 
 
 def follow(
-    caster: RayCaster, photons: Photons, random: np.random.Generator, *, bounces: int, diffuse: bool
+    caster: RayCaster,
+    materials: Sequence[Material],
+    photons: Photons,
+    random: np.random.Generator,
+    *,
+    bounces: int,
+    diffuse: bool,
 ) -> Iterator[Photons]:
     """Scatter photons up to ``bounces`` times.
 
@@ -71,10 +79,12 @@ def follow(
     ----------
     caster
         The scene.
+    materials
+        How its surfaces scatter, by number.
     photons
         At the surface that scatters them first.
     random
-        Chooses directions.
+        Chooses between two kinds of reflection, and directions after the first.
     bounces
         Reflections at most.
     diffuse
@@ -87,7 +97,7 @@ def follow(
     """
     wanted = np.zeros(len(photons.u), bool) if diffuse else np.ones(len(photons.u), bool)
     for _ in range(bounces):
-        direction, share, lobe_rad, matt = _scatter(caster, photons, random, diffuse)
+        direction, share, lobe_rad, matt = _scatter(materials, photons, random, diffuse)
         on = np.flatnonzero(share > 0)
         if on.size == 0:
             return
@@ -103,34 +113,34 @@ def follow(
             direction,
             hits.surface,
             scattered.lobe_mm + travelled * lobe_rad[on],
+            random.random((on.size, 2)),
         )
         arrived = hits.surface != MISS
         photons, wanted = photons[arrived], wanted[arrived]
-        yield photons[wanted]
+        yield photons[wanted] if diffuse else photons
 
 
 def _scatter(
-    caster: RayCaster, photons: Photons, random: np.random.Generator, diffuse: bool
+    materials: Sequence[Material], photons: Photons, random: np.random.Generator, diffuse: bool
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     """New directions, the shares of flux that go there, the lobes' breadth (rad), which reflections were diffuse."""
     n = len(photons.u)
     direction, share, lobe_rad, matt = np.zeros((n, 3)), np.zeros(n), np.zeros(n), np.zeros(n, bool)
-    uniform = random.random((n, 3))
-    for number, surface in enumerate(caster.surfaces):
-        material = surface.material
+    lot = random.random(n)
+    for number, material in enumerate(materials):
         # One of the two kinds of reflection is drawn and carries the light of both: right on average.
         total = material.specular + (material.diffuse if diffuse else 0.0)
         if total == 0:
             continue
         here = photons.surface == number
-        glossy = here & (uniform[:, 2] * total < material.specular)
+        glossy = here & (lot * total < material.specular)
         lobe_rad[glossy] = material.lobe_rad
         direction[glossy], share[glossy] = scatter_specular(
-            material, photons.direction[glossy], photons.normal[glossy], uniform[glossy, :2]
+            material, photons.direction[glossy], photons.normal[glossy], photons.choice[glossy]
         )
         if material.specular:
             share[glossy] *= total / material.specular
         matt |= here & ~glossy
         share[here & ~glossy] = total
-    direction[matt] = scatter_diffuse(photons.normal[matt], uniform[matt, :2])
+    direction[matt] = scatter_diffuse(photons.normal[matt], photons.choice[matt])
     return direction, share, lobe_rad, matt

@@ -148,11 +148,18 @@ class VGrooveScene(Pose):
     """Two boards that meet in a vertical fold and open towards the camera; each lights the other."""
 
     name: Literal["v_groove"] = "v_groove"
+    pitch_deg: float = Field(
+        15.0,
+        ge=-80,
+        le=80,
+        description="Turn about the horizontal, °; near 0 the glossy faces together throw the projector's image into"
+        " the camera.",
+    )
     opening_deg: float = Field(95.0, gt=10, lt=179, description="Angle between the two faces, °.")
     face_width_mm: Length = Field(110.0, description="Width of one face, from the fold to its free edge, mm.")
     height_mm: Length = Field(180.0, description="Height of the faces, mm.")
     finish: Finish = Field(
-        Finish(reflectance=0.5, gloss=0.25, roughness=0.08), description="The surface of both faces."
+        Finish(reflectance=0.65, gloss=0.25, roughness=0.08), description="The surface of both faces."
     )
 
     def surfaces(self) -> list[Surface]:

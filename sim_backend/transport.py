@@ -3,10 +3,10 @@
 A projector pixel that is fully on sends out a flux of 1; the camera pixel's value is the mean radiance it sees.
 
 - direct light: rays from the camera, `sim_backend.camera_paths`;
-- sharp bounces, over mirrors: photons from the projector, splatted one by one into the camera's pixels, and rays from
-  the camera into mirrors;
-- broad bounces, over rough lobes and matt surfaces: photons as well, but gathered from blocks of projector pixels into
-  cells of camera pixels as coarse as the lobe is broad, cells of one surface apart from those of another.
+- light seen in mirrors: rays from the camera as well;
+- bounces: photons from the projector, `sim_backend.projector_paths`, gathered in cells of the camera's picture, cells
+  of one surface apart from those of another. Light that comes over mirrors keeps the projector's single pixels apart;
+  for lobes and diffuse reflections blocks of projector pixels suffice, and cells as coarse as the lobe is bounce.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import cv2
@@ -23,25 +23,29 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from scanner.rig import Rig
-from sim_backend.camera_paths import Joinable, Paths, View, trace_camera
+from sim_backend.camera_paths import Paths, View, trace_camera
+from sim_backend.columns import Columns
 from sim_backend.kernels import Floats, SparseRows, in_parallel, spread_spots
 from sim_backend.projector_paths import Photons, emit, follow
 from sim_backend.raycasting import MISS, RayCaster
 from sim_backend.settings import TransportSettings
-from sim_backend.surfaces import Array, Surface
+from sim_backend.surfaces import Array, Material, Surface
 from sim_backend.viewpoint import Viewpoint, bilinear_shares
 
 _PIXELS_AT_ONCE = 40_000
 _PATHS_AT_ONCE = 50_000
-_SHARP_PX = 0.5
-"""Lobes that spread light by less than this on the camera's picture are splatted photon by photon."""
+_PILOT_STEP_PX = 8
+_SPACING = 0.6
+"""Photons at most this far apart, in cells, leave ripples of a few per cent."""
+_GRID_VARIANCE = 5 / 12
+"""How much gathering light in blocks and cells of width c spreads it, in c²: two linear interpolations and a box."""
 _LEAST_MASS = 0.05
 """Cells that hold less of a surface than this share get no more radiance than such a share would."""
 
 
 @dataclass(frozen=True, eq=False)
-class BroadBounce:
-    """Bounced light too smooth to need single pixels.
+class Bounce:
+    """Bounced light that arrives on one surface.
 
     Parameters
     ----------
@@ -86,19 +90,19 @@ class Transport:
         (width, height), px.
     view
         What the pixel centres see.
-    direct, sharp
-        (camera pixels, projector pixels) direct light, and bounces over mirrors.
-    broad
-        Smooth bounces.
+    direct, by_mirror
+        (camera pixels, projector pixels) direct light, and how it is seen in mirrors.
+    bounces
+        Light that a surface gets from others.
     seen_in_mirror
-        (camera pixels, camera pixels) how bounced light is seen once more in mirrors.
+        (camera pixels, camera pixels) how that light is seen in mirrors.
     """
 
     projector_size: tuple[int, int]
     view: View
     direct: SparseRows
-    sharp: SparseRows
-    broad: tuple[BroadBounce, ...]
+    by_mirror: SparseRows
+    bounces: tuple[Bounce, ...]
     seen_in_mirror: SparseRows
 
     def direct_light(self, light_out: Floats) -> Floats:
@@ -107,8 +111,8 @@ class Transport:
 
     def bounced_light(self, light_out: Floats, *, diffuse: bool = True) -> Floats:
         """(height, width) radiance of light that took more than one reflection; without diffuse ones if so asked."""
-        light = (self.sharp @ light_out.ravel()).reshape(self.view.surface.shape)
-        for bounce in self.broad:
+        light = (self.by_mirror @ light_out.ravel()).reshape(self.view.surface.shape)
+        for bounce in self.bounces:
             if diffuse or not bounce.diffuse:
                 bounce.add_to(light, light_out, self.view)
         if self.seen_in_mirror.value.size:
@@ -119,31 +123,29 @@ class Transport:
         """The same as named arrays, for a file."""
         arrays = {"projector_size": np.array(self.projector_size)}
         arrays |= {f"view.{f.name}": getattr(self.view, f.name) for f in fields(View)}
-        for name in ("direct", "sharp", "seen_in_mirror"):
+        for name in ("direct", "by_mirror", "seen_in_mirror"):
             arrays |= _matrix_arrays(name, getattr(self, name))
-        for number, bounce in enumerate(self.broad):
+        for number, bounce in enumerate(self.bounces):
             scalars = [bounce.diffuse, bounce.block_px, bounce.cell_px, bounce.surface]
-            arrays |= {f"broad.{number}.scalars": np.array(scalars), f"broad.{number}.cell": bounce.cell}
-            arrays |= _matrix_arrays(f"broad.{number}", bounce.exchange)
+            arrays |= {f"bounce.{number}.scalars": np.array(scalars), f"bounce.{number}.cell": bounce.cell}
+            arrays |= _matrix_arrays(f"bounce.{number}", bounce.exchange)
         return arrays
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Transport:
         """Inverse of `to_arrays`."""
         width, height = (int(n) for n in arrays["projector_size"])
-        broad = []
-        while f"broad.{len(broad)}.cell" in arrays:
-            name = f"broad.{len(broad)}"
+        bounces: list[Bounce] = []
+        while f"bounce.{len(bounces)}.cell" in arrays:
+            name = f"bounce.{len(bounces)}"
             diffuse, block, cell, surface = (int(n) for n in arrays[f"{name}.scalars"])
-            broad.append(
-                BroadBounce(bool(diffuse), block, cell, surface, arrays[f"{name}.cell"], _matrix(name, arrays))
-            )
+            bounces.append(Bounce(bool(diffuse), block, cell, surface, arrays[f"{name}.cell"], _matrix(name, arrays)))
         return cls(
             (width, height),
             View(**{f.name: arrays[f"view.{f.name}"] for f in fields(View)}),
             _matrix("direct", arrays),
-            _matrix("sharp", arrays),
-            tuple(broad),
+            _matrix("by_mirror", arrays),
+            tuple(bounces),
             _matrix("seen_in_mirror", arrays),
         )
 
@@ -153,31 +155,52 @@ def trace(surfaces: Sequence[Surface], rig: Rig, settings: TransportSettings) ->
     caster, camera, projector = RayCaster(surfaces), Viewpoint.camera(rig), Viewpoint.projector(rig)
     seen = trace_camera(caster, camera, projector, settings.supersample, settings.specular_bounces)
     bounces = _Bounces(caster, camera, projector, seen.view)
-    sharp: list[Paths] = [seen.by_mirror]
-    broad: list[BroadBounce] = []
+    bounced: list[Bounce] = []
     lit = _first_surfaces(caster, projector)
     for number, surface in enumerate(surfaces):
         if surface.material.specular:
-            found = bounces.trace(lit == number, number, settings.photons, settings.specular_bounces)
-            spread = float(np.median(found.lobe_px)) if found.lobe_px.size else 0.0
-            if spread < _SHARP_PX:
-                sharp.append(bounces.splatted(found))
+            coarse, materials = _resolution(bounces, lit == number, number, settings)
+            found = bounces.trace(materials, lit == number, number, settings.photons, settings.specular_bounces)
+            if coarse:
+                bounced += bounces.gathered(found, coarse, coarse)
             else:
-                # Blocks and cells of half the lobe's breadth widen it by a few per cent only.
-                coarse = 2 ** max(0, math.floor(math.log2(spread / 2)))
-                broad += bounces.gathered(found, coarse, coarse, diffuse=False)
-    if any(surface.material.diffuse for surface in surfaces):
-        found = bounces.trace(lit != MISS, None, settings.photons, settings.diffuse_bounces)
+                bounced += bounces.gathered(found, max(1, math.ceil(_spacing_px(found) / _SPACING)), None)
+    as_they_are = [surface.material for surface in surfaces]
+    if any(material.diffuse for material in as_they_are):
+        found = bounces.trace(as_they_are, lit != MISS, None, settings.photons, settings.diffuse_bounces)
         block, cell = max(1, rig.projector.size[0] // 40), max(1, rig.camera.size[0] // 64)
-        broad += bounces.gathered(found, block, cell, diffuse=True)
+        bounced += bounces.gathered(found, cell, block, diffuse=True)
     return Transport(
         rig.projector.size,
         seen.view,
         seen.direct,
-        _spread_over_projector(Paths.joined(sharp), seen.view.surface.size, rig.projector.size),
-        tuple(broad),
+        _over_pixels(seen.by_mirror, seen.view.surface.size, rig.projector.size),
+        tuple(bounced),
         seen.seen_in_mirror,
     )
+
+
+def _resolution(
+    bounces: _Bounces, lit: NDArray[np.bool_], number: int, settings: TransportSettings
+) -> tuple[int, list[Material]]:
+    """How coarsely to gather the light that surface ``number`` reflects, px, 0 for not at all, and with what lobe.
+
+    Wide cells keep the noise of single photons down. They spread the light themselves: the widest that do not do so
+    more than the lobe are taken, and the lobe that is traced is narrower by as much. Where even single pixels spread
+    light more than the lobe, the surface is traced as a mirror.
+    """
+    materials = [surface.material for surface in bounces.caster.surfaces]
+    pilot = np.zeros_like(lit)
+    pilot[::_PILOT_STEP_PX, ::_PILOT_STEP_PX] = lit[::_PILOT_STEP_PX, ::_PILOT_STEP_PX]
+    found = bounces.trace(materials, pilot, number, 0, settings.specular_bounces)
+    spread = float(np.median(found.lobe_px)) if found.lobe_px.size else 0.0
+    widest = spread / math.sqrt(_GRID_VARIANCE)
+    coarse = 2 ** math.floor(math.log2(widest)) if widest >= 1 else 0
+    narrower = math.sqrt(1 - (coarse / widest) ** 2) if coarse else 0.0
+    # The lobe's breadth goes with the square of the roughness.
+    roughness = materials[number].roughness * math.sqrt(narrower)
+    materials[number] = replace(materials[number], roughness=roughness)
+    return coarse, materials
 
 
 def _first_surfaces(caster: RayCaster, projector: Viewpoint) -> NDArray[np.int8]:
@@ -194,7 +217,7 @@ def _first_surfaces(caster: RayCaster, projector: Viewpoint) -> NDArray[np.int8]
 
 
 @dataclass(frozen=True, eq=False)
-class _Arrivals(Joinable):
+class _Arrivals(Columns):
     """Photons on matt surfaces that the camera sees: where from, where in its picture, how bright, how far spread."""
 
     u: Floats
@@ -219,11 +242,20 @@ class _Bounces:
     projector: Viewpoint
     view: View
 
-    def trace(self, lit: NDArray[np.bool_], surface: int | None, photons: int, bounces: int) -> _Arrivals:
+    def trace(
+        self,
+        materials: Sequence[Material],
+        lit: NDArray[np.bool_],
+        surface: int | None,
+        photons: int,
+        bounces: int,
+    ) -> _Arrivals:
         """Follow about ``photons`` photons that start from the projector pixels ``lit`` and see where they end.
 
         Parameters
         ----------
+        materials
+            How the surfaces scatter, by number.
         lit
             (height, width) bool of the projector. Each pixel sends out at least one photon, and as many as there are
             squares in the finest grid on it that the number of photons allows.
@@ -244,8 +276,17 @@ class _Bounces:
             if surface is None:
                 # Off the regular grid, so that few photons per pixel make noise and no moiré.
                 here += (random.random(here.shape) - 0.5) / squares
-            started = emit(self.caster, self.projector, here.reshape(-1, 2), 1 / squares**2, surface)
-            ends = follow(self.caster, started, random, bounces=bounces, diffuse=surface is None)
+            # Each pixel takes the same even set of directions, shifted at random.
+            choice = (_even_set(squares**2) + random.random((len(here), 1, 2))) % 1
+            started = emit(
+                self.caster,
+                self.projector,
+                here.reshape(-1, 2),
+                1 / squares**2,
+                choice.reshape(-1, 2),
+                surface,
+            )
+            ends = follow(self.caster, materials, started, random, bounces=bounces, diffuse=surface is None)
             return _Arrivals.joined([_Arrivals.none(), *(self.seen(end) for end in ends)])
 
         return _Arrivals.joined([_Arrivals.none(), *in_parallel(batch, range(0, row.size, at_once))])
@@ -265,40 +306,53 @@ class _Bounces:
         )
         return _Arrivals(u, v, x, y, bright, spread, photons.surface[at])
 
-    def splatted(self, found: _Arrivals) -> Paths:
-        """Each photon shared among the four camera pixels about it."""
-        pixel, share = bilinear_shares(np.stack((found.x, found.y), 1), self.camera.lens.size)
-        weight = (share * found.weight[:, None]).ravel()
-        return Paths(pixel.ravel(), np.repeat(found.u, 4), np.repeat(found.v, 4), weight)
+    def gathered(self, found: _Arrivals, cell_px: int, block_px: int | None, *, diffuse: bool = False) -> list[Bounce]:
+        """Photons by camera cell and projector block, one `Bounce` for each surface they arrived on.
 
-    def gathered(self, found: _Arrivals, block_px: int, cell_px: int, *, diffuse: bool) -> list[BroadBounce]:
-        """Photons by projector block and camera cell, one `BroadBounce` for each surface they arrived on."""
-        shape = self.view.surface.shape
-        grid, blocks = _coarse(shape, cell_px), _coarse(self.projector.lens.size[::-1], block_px)
+        With ``block_px`` None the projector's single pixels and their spots are kept apart.
+        """
+        grid = _coarse(self.view.surface.shape, cell_px)
         bounces = []
         for number in np.unique(found.surface):
-            there = found.surface == number
-            place = (np.stack((found.x, found.y), 1)[there] + 0.5) / cell_px - 0.5
+            there = found[found.surface == number]
+            place = (np.stack((there.x, there.y), 1) + 0.5) / cell_px - 0.5
             cell, share = bilinear_shares(np.clip(place, 0, np.array(grid[::-1]) - 1), grid[::-1])
-            column, row = (((w[there] + 0.5) // block_px).astype(np.int64) for w in (found.u, found.v))
-            block = np.clip(row, 0, blocks[0] - 1) * blocks[1] + np.clip(column, 0, blocks[1] - 1)
             # A cell's radiance is the mean over the pixels it spreads to, so that no light is lost or made.
             mass = np.maximum(_cell_mass(self.view.surface == number, cell_px).ravel(), _LEAST_MASS * cell_px**2)
-            value = share * found.weight[there, None] / mass[cell]
-            matrix = sparse.csr_array(
-                (value.ravel(), (cell.ravel(), np.repeat(block, 4))), shape=(math.prod(grid), math.prod(blocks))
+            used, row = np.unique(cell, return_inverse=True)
+            paths = Paths(
+                row.ravel().astype(np.int32),
+                np.repeat(there.u, 4),
+                np.repeat(there.v, 4),
+                (share * there.weight[:, None] / mass[cell]).ravel().astype(np.float32),
             )
-            used = np.flatnonzero(np.diff(matrix.indptr))
-            bounces.append(
-                BroadBounce(diffuse, block_px, cell_px, int(number), used.astype(np.int32), SparseRows.of(matrix[used]))
-            )
+            if block_px is None:
+                exchange = _over_pixels(paths, used.size, self.projector.lens.size)
+            else:
+                exchange = _over_blocks(paths, used.size, self.projector.lens.size, block_px)
+            bounces.append(Bounce(diffuse, block_px or 1, cell_px, int(number), used, exchange))
         return bounces
+
+
+def _spacing_px(found: _Arrivals) -> float:
+    """How far photons lie apart in the camera's picture, by the number of them in squares of 16 px."""
+    if found.x.size == 0:
+        return 0.0
+    square = (found.y // 16).astype(np.int64) * 65536 + (found.x // 16).astype(np.int64)
+    _, which, count = np.unique(square, return_inverse=True, return_counts=True)
+    return float(16 / np.sqrt(np.median(count[which])))
 
 
 def _grid(squares: int) -> Array:
     """(squares², 2) middles of the squares of a grid on a pixel, relative to the pixel's centre."""
     offset = (np.arange(squares) + 0.5) / squares - 0.5
     return np.stack(np.meshgrid(offset, offset), -1).reshape(-1, 2)
+
+
+def _even_set(count: int) -> Array:
+    """(count, 2) points that fill the unit square evenly (Roberts' R₂ sequence, from the plastic number)."""
+    plastic = 1.3247179572447460
+    return np.asarray(np.arange(count)[:, None] * np.array([1 / plastic, 1 / plastic**2]) % 1)
 
 
 def _coarse(shape: tuple[int, ...], step: int) -> tuple[int, int]:
@@ -332,17 +386,25 @@ def _interpolation(pixels: int, cells: int, step: int) -> sparse.csr_array:
     return sparse.csr_array(entries, shape=(pixels, cells))
 
 
-def _spread_over_projector(paths: Paths, pixels: int, projector_size: tuple[int, int]) -> SparseRows:
-    """(pixels, projector pixels) the matrix of light paths."""
+def _over_blocks(paths: Paths, rows: int, projector_size: tuple[int, int], step: int) -> SparseRows:
+    """(rows, blocks) the matrix of light paths from blocks of projector pixels."""
+    down, across = _coarse(projector_size[::-1], step)
+    column, row = (((w + 0.5) // step).astype(np.int64) for w in (paths.u, paths.v))
+    block = np.clip(row, 0, down - 1) * across + np.clip(column, 0, across - 1)
+    return SparseRows.of(sparse.csr_array((paths.weight, (paths.pixel, block)), shape=(rows, down * across)))
+
+
+def _over_pixels(paths: Paths, rows: int, projector_size: tuple[int, int]) -> SparseRows:
+    """(rows, projector pixels) the matrix of light paths from spots of projector pixels."""
     number = np.arange(paths.pixel.size, dtype=np.int32)
-    by_pixel = sparse.csr_array((paths.weight, (paths.pixel, number)), shape=(pixels, max(1, number.size)))
-    start = by_pixel.indptr.astype(np.int64)
+    by_row = sparse.csr_array((paths.weight, (paths.pixel, number)), shape=(rows, max(1, number.size)))
+    start = by_row.indptr.astype(np.int64)
     ends = np.searchsorted(start, np.arange(_PATHS_AT_ONCE, start[-1] + _PATHS_AT_ONCE, _PATHS_AT_ONCE))
-    cuts = np.unique(np.concatenate(([0], np.minimum(ends, pixels), [pixels])))
+    cuts = np.unique(np.concatenate(([0], np.minimum(ends, rows), [rows])))
 
     def block(begin: int, end: int) -> SparseRows:
         a, b = start[begin], start[end]
-        path, weight = by_pixel.indices[a:b].astype(np.int32), by_pixel.data[a:b]
+        path, weight = by_row.indices[a:b].astype(np.int32), by_row.data[a:b]
         return spread_spots(start[begin : end + 1] - a, path, weight, paths.u, paths.v, projector_size)
 
     return SparseRows.stacked(list(in_parallel(lambda cut: block(*cut), itertools.pairwise(cuts.tolist()))))

@@ -25,6 +25,7 @@ from scanner.interreflection import (
     variation_statistic,
 )
 from scanner.methods.base import (
+    EPIPOLAR_TOLERANCE_PX,
     FirstRound,
     RoundFrames,
     Setup,
@@ -36,7 +37,7 @@ from scanner.methods.multi_frequency import DecodedAxis, decode_axes, one_path_m
 from scanner.paths import choose_direct, separate_two_paths
 from scanner.patterns import Axis, Plan
 from scanner.phasors import RoundPhasors
-from scanner.regions import inside, literal_mask, sound_mask
+from scanner.regions import continued, inside, lit_together, literal_mask, sound_mask
 from scanner.result import Flag, Maps
 from scanner.rig import Rig
 from scanner.triangulation import triangulate
@@ -72,18 +73,24 @@ class Separated:
 
     Parameters
     ----------
+    shape
+        Of the picture, (H, W).
     pixels
         Flat pixel numbers.
     u, sigma, bounce
         By axis: direct coordinate and its σ, and the coordinate of the other path, px; NaN where not known.
+    plausible
+        Whether the separation fits: good enough to say where to light, where many pixels vote.
     trusted
-        Whether the separation fits and the choice of the direct path is clear.
+        Whether the fringe orders and the choice of the direct path are clear as well: good enough to be a coordinate.
     """
 
+    shape: tuple[int, ...]
     pixels: NDArray[np.intp]
     u: dict[Axis, NDArray[np.float32]]
     sigma: dict[Axis, NDArray[np.float32]]
     bounce: dict[Axis, NDArray[np.float32]]
+    plausible: NDArray[np.bool_]
     trusted: NDArray[np.bool_]
 
 
@@ -172,13 +179,29 @@ class MicroFrequencyShifting:
             mask = literal_mask(nothing if x is None else x[undetected], nothing if y is None else y[undetected], size)
         else:
             s = first.private.separated
-            nothing = np.full(int(s.trusted.sum()), np.nan, np.float32)
-            direct = [s.u[a][s.trusted] if a in s.u else nothing for a in ("x", "y")]
-            bounce = [s.bounce[a][s.trusted] if a in s.bounce else nothing for a in ("x", "y")]
-            mask = sound_mask(direct[0], direct[1], size, setup.scan.lit_margin_px, (bounce[0], bounce[1]))
+            mask = self._sound(first.private, size, setup.scan.lit_margin_px)
         if not mask.any():
             return None
         return replace(first.plan, mask=mask)
+
+    @staticmethod
+    def _sound(private: _Private, size: tuple[int, int], margin_px: float) -> NDArray[np.bool_]:
+        """Light the surfaces of the region that do not light each other, and what lies between their pixels."""
+        s = private.separated
+        nothing = np.full(s.shape, np.nan, np.float32)
+        x, y, bounce_x, bounce_y = (
+            _plane(s, values[a]) if a in values else nothing for values in (s.u, s.bounce) for a in ("x", "y")
+        )
+        chosen = _plane(s, np.ones(s.pixels.size, np.float32)) == 1
+        if len(s.u) == 2:
+            chosen &= lit_together(x, y, bounce_x, bounce_y)
+        # Where the fringe orders of both paths could not be told, the surface around them can.
+        between = private.detection.region & ~chosen
+        direct = [
+            np.append(u[chosen], continued(u, chosen, between) if a in s.u else nothing[between])
+            for a, u in (("x", x), ("y", y))
+        ]
+        return sound_mask(direct[0], direct[1], size, margin_px, (bounce_x[chosen], bounce_y[chosen]))
 
     def fuse(self, first: FirstRound, second: RoundFrames, setup: Setup) -> Maps:
         """Inside the region the answer with the smaller σ among those that pass; outside, round one."""
@@ -228,7 +251,8 @@ class MicroFrequencyShifting:
 def _separate(frames: RoundPhasors, decoded: dict[Axis, DecodedAxis], detection: Detection, setup: Setup) -> Separated:
     """Two paths of every region pixel on every axis, and which of them is direct."""
     pixels = np.flatnonzero(detection.region)
-    empty = Separated(pixels, {}, {}, {}, np.zeros(pixels.size, bool))
+    none = np.zeros(pixels.size, bool)
+    empty = Separated(detection.region.shape, pixels, {}, {}, {}, none, none)
     axes: Sequence[Axis] = tuple(decoded)
     if not pixels.size or any(not _equidistant(_phasors(frames, a).frequency) for a in axes):
         nan = np.full(pixels.size, np.nan, np.float32)
@@ -247,19 +271,24 @@ def _separate(frames: RoundPhasors, decoded: dict[Axis, DecodedAxis], detection:
             setup.rig, pixels, found["x"].u, found["y"].u, found["x"].sigma_u, found["y"].sigma_u
         )
     choice = choose_direct(*(found[a] for a in axes), distance_px=distance, sigma_px=sigma)
-    picks = dict(zip(axes, (choice.ix, choice.iy), strict=False))
     column = np.arange(pixels.size)
-    trusted = choice.confidence > _CLEAR_CHOICE
+    picks = dict(zip(axes, (choice.ix, choice.iy), strict=False))
+    plausible = choice.confidence > 0
+    if distance is not None and sigma is not None:
+        # A pixel that looks into a mirror sees two bounces and nothing direct: neither pair is on its epipolar line.
+        pair = 2 * choice.ix + choice.iy
+        plausible &= distance[pair, column] < EPIPOLAR_TOLERANCE_PX + 5 * sigma[pair, column]
+    clear = choice.confidence > _CLEAR_CHOICE
     u, spread, bounce = {}, {}, {}
     for axis in axes:
         two, pick = found[axis], picks[axis]
         u[axis], spread[axis] = two.u[pick, column], two.sigma_u[pick, column]
         bounce[axis] = two.u[1 - pick, column]
-        trusted &= two.converged & (two.chi2 < chi2_distribution.isf(1 / _REFUSED_ONE_IN, two.dof))
-        trusted &= two.margin > _CLEAR_ORDERS
+        plausible &= two.converged & (two.chi2 < chi2_distribution.isf(1 / _REFUSED_ONE_IN, two.dof))
+        clear &= two.margin > _CLEAR_ORDERS
         extent = frames.plan.extent(axis)
-        trusted &= (u[axis] >= -0.5) & (u[axis] <= extent - 0.5)
-    return Separated(pixels, u, spread, bounce, trusted)
+        plausible &= (u[axis] >= -0.5) & (u[axis] <= extent - 0.5)
+    return Separated(detection.region.shape, pixels, u, spread, bounce, plausible, plausible & clear)
 
 
 def _epipolar_distances(
@@ -303,6 +332,13 @@ def _equidistant(frequency: NDArray[np.float64]) -> bool:
 
 def _put(plane: NDArray[np.float32], separated: Separated, values: NDArray[np.float32]) -> None:
     plane.reshape(-1)[separated.pixels[separated.trusted]] = values[separated.trusted]
+
+
+def _plane(separated: Separated, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W) values of the plausible pixels, NaN elsewhere."""
+    plane = np.full(separated.shape, np.nan, np.float32)
+    plane.reshape(-1)[separated.pixels[separated.plausible]] = values[separated.plausible]
+    return plane
 
 
 def _dilated(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:

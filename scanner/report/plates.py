@@ -162,9 +162,9 @@ def coordinates(maps: Maps) -> str:
                 )
             )
     if maps.epipolar_px is not None:
-        reach = _robust_reach(maps.epipolar_px)
+        title, unit = "Distance from the epipolar line", "px, logarithmic"
         figures.append(
-            _signed("epipolar", "Distance from the epipolar line", maps.epipolar_px, "px", reach).figure(
+            _plate("epipolar", title, np.abs(maps.epipolar_px), "viridis", unit, logarithmic=True).figure(
                 "(x, y) of a true point lies on its line within noise. A smooth pattern over the whole field says that "
                 "the rig has moved since its calibration."
             )

@@ -101,7 +101,7 @@ for (const map of document.querySelectorAll(".grid svg.map, .beside svg.map")) {
   function reset() {
     [yaw, pitch, target] = [0.35, 0.25, [0, 0, 0]];
     const wide = Math.min(1.6, canvas.clientWidth / canvas.clientHeight || 1.6);
-    distance = (0.33 * Math.max(size, 1e-3)) / Math.tan(FIELD_OF_VIEW / 2) * Math.max(1, 1.3 / wide);
+    distance = (0.38 * Math.max(size, 1e-3)) / Math.tan(FIELD_OF_VIEW / 2) * Math.max(1, 1.3 / wide);
   }
 
   function rotation() {
