@@ -118,6 +118,8 @@ def process(
         with terminal.working() as report:
             report("writing the result folder")
             write_result(folder.path, result, rig=chosen_rig)
+    for notice in folder.notices:
+        terminal.note(notice)
     terminal.table(result, folder.out)
     _exit_by_gates(result)
 
@@ -258,8 +260,9 @@ def main() -> None:
     except OperatorError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+    except KeyboardInterrupt as interruption:
+        # The result folder adds where the recording was kept.
+        print("\n".join(["interrupted", *getattr(interruption, "__notes__", [])]), file=sys.stderr)
         sys.exit(INTERRUPTED)
     except typer.Abort:
         sys.exit(INTERRUPTED)

@@ -21,6 +21,10 @@ from scanner.patterns import FringeSequence
 _SAMPLES = 6_000
 _ITERATIONS = 8
 
+_CONVINCING = 1.5
+"""The found step must explain a frame by so much better than the planned one (ratio of mean squares): where the phases
+of all pixels lie close together, the steps can hardly be told, and many explain the frames equally well."""
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -99,12 +103,12 @@ def check_sequence(frames: Pixels, fringes: FringeSequence, saturated_dn: int) -
     found = _estimate_steps(sample, fringes.steps_rad)
     if found is None:
         return SequenceCheck(tuple(findings), unknown, 0.0)
-    steps, gain, usable = found
+    steps, gain, better, usable = found
     off = np.angle(np.exp(1j * (steps - fringes.steps_rad)))
     # A wrong frame is wrong by a whole step; half of one leaves the widest margin to noise and to miscalibrated steps.
     tolerance = 0.5 * np.min(np.abs(np.angle(np.exp(1j * np.diff(fringes.steps_rad)))))
     already = {f.frame for f in findings}
-    for n in np.flatnonzero((np.abs(off) > tolerance) & (gain > 0.2)):
+    for n in np.flatnonzero((np.abs(off) > tolerance) & (gain > 0.2) & (better > _CONVINCING)):
         if int(n) not in already:
             nearest = int(np.argmin(np.abs(np.angle(np.exp(1j * (fringes.steps_rad - steps[n]))))))
             findings.append(
@@ -114,7 +118,7 @@ def check_sequence(frames: Pixels, fringes: FringeSequence, saturated_dn: int) -
                     "a stale, repeated, missing or swapped frame",
                 )
             )
-    for n in np.flatnonzero(np.abs(gain - 1) > 0.3):
+    for n in np.flatnonzero((np.abs(gain - 1) > 0.3) & (better > _CONVINCING)):
         if not any(f.frame == n for f in findings):
             findings.append(
                 Finding(
@@ -137,8 +141,11 @@ def _sample(frames: Pixels, saturated_dn: int) -> NDArray[np.float64]:
 
 def _estimate_steps(
     sample: NDArray[np.float64], planned: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
-    """Steps (rad) and relative fringe contrast of each frame, and the share of pixels used; None without fringes."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float] | None:
+    """Find the steps (rad) and the relative contrast of each frame, and how much better these explain it than the plan.
+
+    The last value is the share of the sampled pixels that was used. None: there are no fringes.
+    """
     centred = sample - sample.mean(axis=0)
     values, vectors = np.linalg.eigh(centred @ centred.T)
     # Two components carry the fringes, a few more their harmonics; without them there is nothing to check (lens cap).
@@ -166,4 +173,17 @@ def _estimate_steps(
                 best, agree = turned, hits
     close = np.abs(np.angle(np.exp(1j * (best - planned)))) < np.pi / len(planned)
     best = best - np.angle(np.mean(np.exp(1j * (best - planned))[close]))
-    return best, gain, float(strong.mean())
+    left = _unexplained(sample[:, strong], gain, steps)
+    left_by_plan = _unexplained(sample[:, strong], np.ones_like(planned), planned)
+    # A frame of another brightness is explained by neither: it stands out from the others instead.
+    better = np.maximum(left_by_plan / np.maximum(left, 1e-12), left_by_plan / (3 * np.median(left_by_plan) + 1e-12))
+    return best, gain, better, float(strong.mean())
+
+
+def _unexplained(
+    sample: NDArray[np.float64], gain: NDArray[np.float64], steps: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(N,) mean square of each frame that a fringe with these contrasts and steps does not explain."""
+    model = np.stack([np.ones_like(steps), gain * np.cos(steps), -gain * np.sin(steps)], axis=1)
+    off = sample - model @ np.linalg.lstsq(model, sample, rcond=None)[0]
+    return np.asarray((off**2).mean(axis=1))

@@ -403,8 +403,14 @@ def unwrap_twin(
 
 
 def compile_all() -> float:
-    """Compile every kernel for 8- and 16-bit frames into the cache; returns the seconds it took."""
+    """Compile every kernel of the package, for 8- and 16-bit frames, into the cache; returns the seconds it took."""
     began = time.perf_counter()
+    from scanner import cloud, paths, triangulation
+
+    few = np.ones((9, 4), np.complex64)
+    paths.separate_two_paths(few, np.array([(80 + t) / 1280 for t in range(9)]), np.ones(4, np.float32), 1280)
+    triangulation.compile_all()
+    cloud.grid_normals(np.ones((1, 1, 3), np.float32), np.ones((1, 1), np.float32))
     steps = 2 * np.pi * np.arange(4) / 4
     z = np.zeros((3, 8), np.complex64)
     for dtype in (np.uint8, np.uint16):

@@ -60,6 +60,11 @@ class RoundPhasors:
         What was projected.
     frame_format
         What frames look like.
+
+    Attributes
+    ----------
+    example
+        (H, W) the first frame that was added, for people to look at.
     """
 
     plan: Plan
@@ -74,6 +79,7 @@ class RoundPhasors:
         self._last_mean: NDArray[np.float32] | None = None
         self._residual = np.zeros(shape, np.float32)
         self.saturated: NDArray[np.bool_] = np.zeros(shape, bool)
+        self.example: Pixels | None = None
 
     @property
     def mean(self) -> NDArray[np.float32]:
@@ -126,6 +132,8 @@ class RoundPhasors:
         elif len(steps) == 3:
             self._last_mean = mean
         self._mean_sum += mean
+        if self.example is None:
+            self.example = frames[0].copy()
         self.added.add(sequence)
 
     def axis(self, axis: Axis) -> AxisPhasors | None:

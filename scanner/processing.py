@@ -69,6 +69,7 @@ def process_take(
         noise=decoder.used_noise,
         frames=frames,
         timings_s=timings,
+        bench=f"{take.manifest['bench'].get('name', 'unknown bench')}, take {take.manifest['uid']}",
         warnings=[*warnings, *decoder.warnings],
     )
 
@@ -98,7 +99,8 @@ def process_images(
         if not found.good:
             names = [p.name for p in recorded.files[number]]
             raise ImagesError(
-                f"{recorded.folder}: the images {', '.join(names)} do not show sequence {number + 1} ({fringes.label}): "
+                f"{recorded.folder}: the images {names[0]} to {names[-1]} do not show sequence "
+                f"{number + 1} ({fringes.label}): "
                 + "; ".join(f"{names[f.frame]}: {f.message}" for f in found.findings),
                 "Correct the order of `files` or of `sequences`, or the phase convention, in the plan file.",
             )
@@ -117,6 +119,7 @@ def process_images(
         noise=decoder.used_noise,
         frames={"images": recorded.plan.frame_count},
         timings_s=timings,
+        bench=f"images of {recorded.folder.name}",
         warnings=decoder.warnings,
     )
 

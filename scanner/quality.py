@@ -27,6 +27,7 @@ def summarise(
     noise: NoiseModel,
     frames: Mapping[str, int],
     timings_s: Mapping[str, float],
+    bench: str,
     warnings: Sequence[str] = (),
 ) -> ScanResult:
     """Count, judge and pack a result.
@@ -45,6 +46,8 @@ def summarise(
         Frames by purpose, such as ``{"round 1": 216, "repeated": 12}``.
     timings_s
         Seconds by stage.
+    bench
+        Where the frames come from, in words.
     warnings
         Sentences for the operator; those about failed gates are added.
     """
@@ -120,6 +123,7 @@ def summarise(
         simulated,
         maps,
         {
+            "bench": bench,
             "counts": counts,
             "frames": dict(frames),
             "timings_s": dict(timings_s),

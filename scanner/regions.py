@@ -69,7 +69,7 @@ def lit_together(
 ) -> NDArray[np.bool_]:
     """Choose surfaces of the region that can be lit at once because none of them lights another.
 
-    A mirror in view shows the camera the lit board a second time, where the projector lights it through the mirror: both
+    A mirror in view shows the camera the board a second time, where the projector lights it through the mirror: both
     places are detected, and each is the other's emitter. The largest surface goes first; whatever would light one that
     is chosen already, or be lit by it, stays dark.
 
@@ -117,7 +117,8 @@ def _cells(x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.int64]:
     """Number of the cell that each coordinate lies in, -1 for NaN."""
     cells = np.full(x.shape, -1, np.int64)
     known = np.isfinite(x) & np.isfinite(y)
-    cells[known] = np.floor(y[known] / _CELL_PX).astype(np.int64) * 100_000 + np.floor(x[known] / _CELL_PX).astype(np.int64)
+    row, column = (np.floor(u[known] / _CELL_PX).astype(np.int64) for u in (y, x))
+    cells[known] = row * 100_000 + column
     return cells
 
 

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers import Pixels
+
 
 class Flag(IntFlag):
     """Why a pixel is as it is; any number may be set. Pixels with NaN coordinates carry at least one of them."""
@@ -94,7 +96,7 @@ class Maps:
     y_p_round1: NDArray[np.float32] | None = None
     misfit_round2: NDArray[np.float32] | None = None
     lit: NDArray[np.bool_] | None = None
-    regional_pattern: NDArray[np.uint8] | NDArray[np.uint16] | None = None
+    regional_pattern: Pixels | None = None
 
     @property
     def valid(self) -> NDArray[np.bool_]:

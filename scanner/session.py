@@ -55,7 +55,7 @@ def run_scan(loaded: LoadedConfig, out: Path, overwrite: bool, listener: Listene
                 decoder = Decoder(method, config.scan, bench.noise, rig)
                 acquisition = Acquisition(bench, method, config.scan, decoder, take, listener)
                 maps = acquisition.run()
-            simulated = bench.simulated
+            simulated, name = bench.simulated, bench.name
         assert decoder.used_noise is not None
         timings = {"open bench": opened - began, **acquisition.timings_s}
         frames = {f"round {r}": n for r, n in acquisition.frames.items()} | {"repeated": acquisition.repeats}
@@ -67,6 +67,7 @@ def run_scan(loaded: LoadedConfig, out: Path, overwrite: bool, listener: Listene
             noise=decoder.used_noise,
             frames=frames,
             timings_s=timings,
+            bench=name,
             warnings=[*loaded.warnings, *acquisition.notes, *decoder.warnings],
         )
         write_result(
@@ -79,6 +80,8 @@ def run_scan(loaded: LoadedConfig, out: Path, overwrite: bool, listener: Listene
         )
         if not config.output.keep_take:
             folder.discard_take()
+    for notice in folder.notices:
+        listener.note(notice)
     return result, folder.out
 
 

@@ -10,7 +10,7 @@ from scipy import sparse
 
 from sim_backend.columns import Columns
 from sim_backend.kernels import Floats, SparseRows, in_parallel, reflected_radiance, spread_spots
-from sim_backend.raycasting import CLEARANCE_MM, Hits, RayCaster
+from sim_backend.raycasting import Hits, RayCaster
 from sim_backend.reflection import scatter_specular, unit
 from sim_backend.surfaces import Array
 from sim_backend.viewpoint import Viewpoint, bilinear_shares
@@ -213,7 +213,7 @@ class _Tracer:
             if on.size == 0:
                 break
             pixel, direction, share = pixel[on], turned[on], share[on] * reflected[on]
-            hits = self.caster.first_hits(hits.point[on] + CLEARANCE_MM * hits.normal[on], direction)
+            hits = self.caster.first_hits(hits.point[on], direction, leaving=hits.normal[on])
             uv, radiance = self.lit(hits, -direction)
             at = np.flatnonzero(radiance > 0)
             u, v = uv[at].T.astype(np.float32)

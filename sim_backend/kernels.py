@@ -22,8 +22,7 @@ _Result = TypeVar("_Result")
 _CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 _POOL = ThreadPoolExecutor(_CORES, thread_name_prefix="light")
 _ROWS_AT_ONCE = 100_000
-SPOT_TAPS = 16
-"""Projector pixels whose spots reach one place: 4 × 4."""
+_LEAST_BRDF = 1e-6
 
 
 def in_parallel(work: Callable[[_Part], _Result], parts: Iterable[_Part]) -> Iterator[_Result]:
@@ -241,5 +240,6 @@ def reflected_radiance(materials, surface, light, point, normal, to_eye, irradia
             cos_lobe = 2 * cos_in * cos_out - (lx * ex + ly * ey + lz * ez) / length
             peak = concentration / (2 * math.pi * -math.expm1(-2 * concentration))
             value += specular * peak * math.exp(concentration * (cos_lobe - 1)) / max(cos_in, cos_out)
-        radiance[i] = irradiance[i] * value
+        if value > _LEAST_BRDF:  # a lobe fades out and never ends
+            radiance[i] = irradiance[i] * value
     return radiance

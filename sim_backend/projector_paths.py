@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backend.columns import Columns
-from sim_backend.raycasting import CLEARANCE_MM, MISS, RayCaster
+from sim_backend.raycasting import MISS, RayCaster
 from sim_backend.reflection import scatter_diffuse, scatter_specular, unit
 from sim_backend.surfaces import Array, Material
 from sim_backend.viewpoint import Viewpoint
@@ -102,7 +102,7 @@ def follow(
         if on.size == 0:
             return
         scattered, direction, wanted = photons[on], direction[on], wanted[on] | matt[on]
-        hits = caster.first_hits(scattered.point + CLEARANCE_MM * scattered.normal, direction)
+        hits = caster.first_hits(scattered.point, direction, leaving=scattered.normal)
         travelled = np.linalg.norm(hits.point - scattered.point, axis=1)
         photons = Photons(
             scattered.u,

@@ -59,7 +59,7 @@ class RayCaster:
         )
         """(surfaces, 3) diffuse share, specular share, concentration of the lobe."""
 
-    def first_hits(self, origin: Array, direction: Array) -> Hits:
+    def first_hits(self, origin: Array, direction: Array, leaving: Array | None = None) -> Hits:
         """What rays meet first.
 
         Parameters
@@ -68,8 +68,11 @@ class RayCaster:
             (3,) or (n, 3) mm.
         direction
             (n, 3), any length.
+        leaving
+            (n, 3) unit normals of the surface that the rays start from, if they do.
         """
-        cast = self._scene.cast_rays(_rays(origin, direction))
+        start = origin if leaving is None else origin + CLEARANCE_MM * leaving
+        cast = self._scene.cast_rays(_rays(start, direction))
         # Open3D's number for "none" is the largest uint32, which becomes -1.
         surface = cast["geometry_ids"].numpy().astype(np.int16)
         return Hits(surface, *meet(self._shapes, surface, np.broadcast_to(origin, direction.shape), direction))

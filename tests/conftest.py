@@ -116,3 +116,53 @@ def array_bench():
         return ArrayBench(**(values | changes))
 
     return make
+
+
+@pytest.fixture(scope="session")
+def transport_cache(tmp_path_factory):
+    """Keep traced light in a folder of this test run."""
+    folder = tmp_path_factory.mktemp("transport")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MFS_SCANNER_CACHE", str(folder))
+        yield folder
+
+
+@pytest.fixture(scope="session")
+def scan_simulated(transport_cache, tmp_path_factory):
+    """Scan a simulated scene with a method; returns (maps, truth). The same scan is made once."""
+    import json
+
+    from scanner.acquisition import Acquisition
+    from scanner.config import ScanSection
+    from scanner.decoding import Decoder
+    from scanner.methods import METHODS
+    from scanner.rig import Rig
+    from scanner.take import TakeWriter
+    from sim_backend.bench import kind, truth_of
+    from sim_backend.settings import SimulatedSettings
+
+    done: dict[str, Any] = {}
+
+    def scan(scene: dict[str, Any], method: str = "mfs", options: dict[str, Any] | None = None, **settings: Any):
+        key = json.dumps([scene, method, options, settings], sort_keys=True)
+        if key not in done:
+            done[key] = run(scene, method, options, settings)
+        return done[key]
+
+    def run(scene, method, options, settings):
+        wanted = SimulatedSettings.model_validate({"scene": scene, **settings})
+        section, chosen = ScanSection(method=method, **(options or {})), METHODS[method]
+        with kind.open(wanted) as bench:
+            plan = chosen.first_round(section, bench.projector_size)
+            folder = tmp_path_factory.mktemp("scan")
+            manifest = {"method": method, "bench": {}, "config": {}, "plans": [plan.to_json()], "simulated": True}
+            with TakeWriter.create(
+                folder / "take", frame_format=bench.frame_format, slots=plan.frame_count, manifest=manifest
+            ) as take:
+                decoder = Decoder(chosen, section, bench.noise, Rig.from_json(bench.rig))
+                maps = Acquisition(bench, chosen, section, decoder, take).run()
+        # The frames of one scan fill 340 MB; the maps are all that is judged.
+        (folder / "take" / "frames.bin").unlink()
+        return maps, truth_of(wanted)
+
+    return scan

@@ -165,9 +165,15 @@ def nearest_code(
     # One code element has the frame's own noise, and that of the mean and of the phase it is predicted from.
     scale = (amplitude / sigma_i) ** 2 / np.float32(1 + 1 / 3 + 1 / 3)
     with np.errstate(invalid="ignore", divide="ignore"):
-        sigma = sigma_z / (np.float32(2 * np.pi * frequency[0]) * amplitude)
+        sigma_u = sigma_z / (np.float32(2 * np.pi * frequency[0]) * amplitude)
         lead = np.nan_to_num((second - best) * scale / 2)
-    planes = (np.asarray(p, np.float32).reshape(shape) for p in (u, sigma, amplitude, best * scale, lead))
-    u, sigma, amplitude, chi2, lead = planes
-    coordinates = Coordinates(fringes.axis, u, sigma, amplitude, chi2, len(frequency) - 1, lead)
+    coordinates = Coordinates(
+        axis=fringes.axis,
+        u=u.reshape(shape),
+        sigma=np.asarray(sigma_u, np.float32).reshape(shape),
+        amplitude=np.asarray(amplitude, np.float32).reshape(shape),
+        chi2=np.asarray(best * scale, np.float32).reshape(shape),
+        dof=len(frequency) - 1,
+        lead=np.asarray(lead, np.float32).reshape(shape),
+    )
     return coordinates, mean.reshape(shape), sigma_z.reshape(shape)

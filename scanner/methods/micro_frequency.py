@@ -178,7 +178,6 @@ class MicroFrequencyShifting:
             nothing = np.full(shape, np.nan, np.float32)
             mask = literal_mask(nothing if x is None else x[undetected], nothing if y is None else y[undetected], size)
         else:
-            s = first.private.separated
             mask = self._sound(first.private, size, setup.scan.lit_margin_px)
         if not mask.any():
             return None
@@ -204,7 +203,11 @@ class MicroFrequencyShifting:
         return sound_mask(direct[0], direct[1], size, margin_px, (bounce_x[chosen], bounce_y[chosen]))
 
     def fuse(self, first: FirstRound, second: RoundFrames, setup: Setup) -> Maps:
-        """Inside the region the answer with the smaller σ among those that pass; outside, round one."""
+        """Inside the region round two where it passes, else the separated paths where these are clear; outside, round one.
+
+        Round two goes first even where the separation predicts the smaller σ: it removed the bounce, the separation has
+        to assume how many there are, and where both paths nearly coincide its σ says little.
+        """
         assert isinstance(first.private, _Private)
         assert isinstance(second, RoundPhasors)
         private, lit = first.private, second.plan.mask
@@ -226,13 +229,12 @@ class MicroFrequencyShifting:
         flags[region & usable & ~lit_here & maps2.valid] |= np.uint16(Flag.NOT_LIT)
         flags[region & second.saturated] |= np.uint16(Flag.SATURATED)
         one = first.maps
-        better = passed & ~_smaller(one, maps2)
 
         def merged(old: NDArray[np.float32] | None, new: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
-            return None if old is None or new is None else np.where(better, new, old)
+            return None if old is None or new is None else np.where(passed, new, old)
 
-        flags[better] |= np.uint16(Flag.SECOND_ROUND)
-        flags[better] &= ~np.uint16(
+        flags[passed] |= np.uint16(Flag.SECOND_ROUND)
+        flags[passed] &= ~np.uint16(
             Flag.SEPARATED | Flag.MISFIT | Flag.NOT_LIT | Flag.OFF_EPIPOLAR | Flag.OUT_OF_VOLUME
         )
         fused = replace(
@@ -240,6 +242,7 @@ class MicroFrequencyShifting:
             flags=flags,
             misfit_round2=np.where(target & usable, total / np.float32(dof), np.float32(np.nan)),
             lit=lit,
+            regional_pattern=second.example,
             x_p=merged(one.x_p, maps2.x_p),
             y_p=merged(one.y_p, maps2.y_p),
             sigma_x=merged(one.sigma_x, maps2.sigma_x),
@@ -353,16 +356,8 @@ def _lit_here(
     if x is not None and y is not None:
         return inside(lit, x, y, _CLEARANCE_PX)
     if x is not None:
-        return inside(np.broadcast_to(lit.any(axis=0), lit.shape).copy(), x, np.zeros_like(x), _CLEARANCE_PX)
+        columns = np.asarray(lit.any(axis=0))
+        return inside(np.repeat(columns[None], lit.shape[0], axis=0), x, np.zeros_like(x), _CLEARANCE_PX)
     assert y is not None
-    return inside(np.broadcast_to(lit.any(axis=1)[:, None], lit.shape).copy(), np.zeros_like(y), y, _CLEARANCE_PX)
-
-
-def _smaller(one: Maps, two: Maps) -> NDArray[np.bool_]:
-    """Where round one's own answer (separated paths) has the smaller predicted variance."""
-    variances = []
-    for maps in (one, two):
-        parts = [s**2 for s in (maps.sigma_x, maps.sigma_y) if s is not None]
-        variances.append(np.sum(parts, axis=0))
-    with np.errstate(invalid="ignore"):
-        return one.valid & np.asarray(variances[0] < variances[1])
+    rows = np.asarray(lit.any(axis=1))
+    return inside(np.repeat(rows[:, None], lit.shape[1], axis=1), np.zeros_like(y), y, _CLEARANCE_PX)

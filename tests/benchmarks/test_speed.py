@@ -112,8 +112,9 @@ with TakeWriter.create(folder, frame_format=fmt, slots=plan.frame_count, manifes
     for s, sequence in enumerate(plan.sequences):
         for n, fringe in enumerate(sequence.fringes):
             shift = int(rng.integers(1, width))
-            frame = 110 + 80 * np.cos(np.float32(2 * np.pi * fringe.frequency) * u[sequence.axis] + np.float32(fringe.step_rad))
-            take.write_frame(1, s, 1, n, np.rint(frame + np.roll(noise, shift)).astype(np.uint8), FrameStamp(0, 0.0, 0.0))
+            phase = np.float32(2 * np.pi * fringe.frequency) * u[sequence.axis] + np.float32(fringe.step_rad)
+            frame = np.rint(110 + 80 * np.cos(phase) + np.roll(noise, shift)).astype(np.uint8)
+            take.write_frame(1, s, 1, n, frame, FrameStamp(0, 0.0, 0.0))
         take.commit_sequence(1, s, 1)
 """
 

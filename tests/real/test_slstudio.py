@@ -44,8 +44,8 @@ def test_skull(tmp_path):
     assert 0.97 * 381_000 < known.sum() < 1.005 * 381_000
     assert np.median(depth[known]) == pytest.approx(386.4, abs=0.5)
 
-    # Independent: the classical order from the coarse phase, and the plane of light intersected in closed form after the
-    # projector's distortion was undone at the point found.
+    # Independent: the classical order from the coarse phase, and the plane of light intersected in closed form once the
+    # projector's distortion is undone at the point found.
     frames = np.stack([cv2.imread(str(SLSTUDIO / "skull_2x3" / f"{i:02d}.png"), 0) for i in range(6)]).astype(float)
     turn = np.exp(2j * np.pi * np.arange(3) / 3)[:, None, None]
     fine, coarse = (frames[:3] * turn).sum(0), (frames[3:] * turn).sum(0)

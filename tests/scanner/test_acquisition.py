@@ -219,7 +219,7 @@ def test_disk_full_in_the_middle_ends_with_a_word_and_a_dark_projector(array_ben
         return real(*args)
 
     monkeypatch.setattr(os, "pwrite", full)
-    with pytest.raises(OperatorError, match="space|safe") as caught:
+    with pytest.raises(OperatorError, match=r"space|safe") as caught:
         run(job)
     assert getattr(caught.value, "exit_code", None) == 3
     assert bench.dark

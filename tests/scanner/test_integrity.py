@@ -73,6 +73,24 @@ def test_blank_and_mixed_frames_are_found():
     assert 6 in [f.frame for f in check_sequence(torn, plan, 255).findings]
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_part_of_one_fringe_is_no_reason_for_alarm(seed):
+    # One period over the projector, of which the object sees a third; half of the pixels see a bounce as well.
+    rng = np.random.default_rng(seed)
+    plan = phase_steps("x", 1 / 1280, 12)
+    u = np.broadcast_to(np.linspace(300, 750, SHAPE[1]), SHAPE)
+    alpha = np.where(u < 500, 0.5, 0.0)
+    frames = [
+        5 + 80 * (1 + np.cos(2 * np.pi * u / 1280 + s)) + 80 * alpha * (1 + np.cos(2 * np.pi * (900 - u) / 1280 + s))
+        for s in plan.steps_rad
+    ]
+    noisy = np.rint(np.stack(frames) * 0.9 + rng.normal(0, 1.5, (12, *SHAPE))).astype(np.uint8)
+    assert check_sequence(noisy, plan, 255).good
+    stale = noisy.copy()
+    stale[6] = np.clip(noisy[5] + rng.normal(0, 1.0, SHAPE), 0, 255).astype(np.uint8)
+    assert not check_sequence(stale, plan, 255).good
+
+
 def test_without_fringes_there_is_nothing_to_say():
     rng = np.random.default_rng(1)
     noise = rng.normal(5, 1.5, (12, *SHAPE)).clip(0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Coordinates and their σ against what was put in, and against the bound √(2/N) σ_I / (2π f B), all frequencies fused."""
+"""Coordinates and their σ against what was put in, and against the bound √(2/N) σ_I / (2π f B), frequencies fused."""
 
 from __future__ import annotations
 
