@@ -6,13 +6,14 @@ Exit codes: 0 done; 2 bad configuration or usage; 3 hardware; 4 the scan ran but
 
 from __future__ import annotations
 
+import functools
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, ParamSpec
 
 import typer
 
@@ -39,7 +40,25 @@ SetOption = Annotated[
 ]
 
 
+P = ParamSpec("P")
+
+
+def interruptible(command: Callable[P, None]) -> Callable[P, None]:
+    """Let Ctrl-C end a command with a word; the result folder has added where the recording was kept."""
+
+    @functools.wraps(command)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            command(*args, **kwargs)
+        except KeyboardInterrupt as interruption:
+            print("\n".join(["interrupted", *getattr(interruption, "__notes__", [])]), file=sys.stderr)
+            raise typer.Exit(INTERRUPTED) from None
+
+    return wrapped
+
+
 @app.callback(invoke_without_command=True)
+@interruptible
 def scan(
     context: typer.Context,
     config: Annotated[Path | None, typer.Option("--config", "-c", help="Bench file (YAML).")] = None,
@@ -67,6 +86,7 @@ def scan(
 
 
 @app.command()
+@interruptible
 def process(
     source: Annotated[Path, typer.Argument(help="A take, a result folder that holds one, or a folder of images.")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Result folder; default: process-<time>.")] = None,
@@ -125,6 +145,7 @@ def process(
 
 
 @app.command()
+@interruptible
 def compare(
     config: ConfigOption,
     methods: Annotated[str, typer.Option("--methods", help="Comma-separated names.")] = "mfs,tps,mps,mps_gn",
@@ -252,29 +273,25 @@ def _terminable() -> Iterator[None]:
 
 def main() -> None:
     """Entry point of `scan`: every error an operator can meet is a message, never a traceback."""
-    from drivers.errors import OperatorError
-
     try:
         with _terminable():
             code = app(standalone_mode=False)
-    except OperatorError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
-    except KeyboardInterrupt as interruption:
-        # The result folder adds where the recording was kept.
-        print("\n".join(["interrupted", *getattr(interruption, "__notes__", [])]), file=sys.stderr)
-        sys.exit(INTERRUPTED)
-    except typer.Abort:
+    except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
     except Exception as error:
-        _usage_or_raise(error)
+        sys.exit(_explain(error))
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _usage_or_raise(error: Exception) -> NoReturn:
-    """Show what the command-line parser refuses; anything else is a fault of the program and keeps its traceback."""
-    show = getattr(error, "show", None)
+def _explain(error: Exception) -> int:
+    """Show an error that an operator can mend and return its exit code; a fault of the program is raised again."""
+    from drivers.errors import OperatorError
+
+    if isinstance(error, OperatorError):
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    show = getattr(error, "show", None)  # what the command-line parser refuses
     if show is None:
         raise error
     show()
-    sys.exit(getattr(error, "exit_code", 2))
+    return int(getattr(error, "exit_code", 2))

@@ -19,8 +19,8 @@ _HARM = 0.02
 _SMALLEST_SURFACE = 12
 """Fewer pixels than this are strays of the separation, not a surface."""
 
-_CONTINUOUS_PX = 4.0
-"""On one surface neighbouring camera pixels see projector pixels no farther apart than this."""
+_CONTINUOUS_PX = 3.0
+"""On one surface the step to the next camera pixel exceeds twice the usual one by no more than this, projector px."""
 
 _DENSITY = 3
 """A projector pixel is believed when at least this many coordinates fall on it and its 8 neighbours."""
@@ -32,6 +32,7 @@ def sound_mask(
     size: tuple[int, int],
     margin_px: float,
     emitters: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None,
+    pitch_px: float = 1.0,
 ) -> NDArray[np.bool_]:
     """Light the direct coordinates of the detected pixels, grown by a margin, except where the bounces come from.
 
@@ -46,19 +47,29 @@ def sound_mask(
         How far the lit set is grown, so that fringes are not cut where they are measured.
     emitters
         (x, y) of the second paths: the margin does not grow onto them.
+    pitch_px
+        Usual distance of the coordinates of neighbouring camera pixels, projector px.
 
     Returns
     -------
     NDArray
         (height, width) bool.
     """
-    core = _close(_believed(_splat(x, y, size)))
+    gap = max(1, int(np.ceil(pitch_px)))
+    core = _close(_believed(_splat(x, y, size), gap), gap)
     reach = int(np.ceil(margin_px))
     grown = cv2.dilate(core.astype(np.uint8), _disc(reach)) > 0 if reach else core
     if emitters is not None:
-        source = _close(_believed(_splat(*emitters, size)))
+        source = _close(_believed(_splat(*emitters, size), gap), gap)
         grown &= core | ~source
     return np.asarray(grown)
+
+
+def pitch(x: NDArray[np.float32], y: NDArray[np.float32]) -> float:
+    """Usual distance (px) of the coordinates (H, W) that neighbouring camera pixels see; 1 where it cannot be told."""
+    steps = [np.abs(np.diff(u, axis=axis)) for u in (x, y) for axis in (0, 1)]
+    usual = [float(np.median(known)) for s in steps if (known := s[np.isfinite(s)]).size]
+    return max(usual, default=1.0)
 
 
 def lit_together(
@@ -69,7 +80,7 @@ def lit_together(
 ) -> NDArray[np.bool_]:
     """Choose surfaces of the region that can be lit at once because none of them lights another.
 
-    A mirror in view shows the camera the board a second time, where the projector lights it through the mirror: both
+    A mirror in view shows the camera the board again, where the projector lights it through the mirror: both
     places are detected, and each is the other's emitter. The largest surface goes first; whatever would light one that
     is chosen already, or be lit by it, stays dark.
 
@@ -85,11 +96,11 @@ def lit_together(
     NDArray
         (H, W) bool, pixels of the chosen surfaces.
     """
-    known = np.isfinite(x) & np.isfinite(y)
-    broken = ~known
+    limit = _CONTINUOUS_PX + 2 * pitch(x, y)
+    broken = ~(np.isfinite(x) & np.isfinite(y))
     for axis in (0, 1):
         step = np.abs(np.diff(x, axis=axis)) + np.abs(np.diff(y, axis=axis))
-        jump = step > _CONTINUOUS_PX
+        jump = step > limit
         broken[(slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))] |= jump
     count, labels, stats, _ = cv2.connectedComponentsWithStats((~broken).astype(np.uint8), connectivity=4)
     by_size = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")
@@ -183,7 +194,7 @@ def literal_mask(x: NDArray[np.float32], y: NDArray[np.float32], size: tuple[int
     Gaps of up to two projector pixels between neighbouring camera pixels are closed: the paper's camera samples the
     projector several times over and has none.
     """
-    return ~_close(_splat(x, y, size) > 0)
+    return ~_close(_splat(x, y, size) > 0, 1)
 
 
 def inside(
@@ -214,16 +225,19 @@ def _splat(x: NDArray[np.float32], y: NDArray[np.float32], size: tuple[int, int]
     return counts.reshape(height, width).astype(np.int32)
 
 
-def _believed(counts: NDArray[np.int32]) -> NDArray[np.bool_]:
+def _believed(counts: NDArray[np.int32], gap: int) -> NDArray[np.bool_]:
     """Pixels that enough coordinates fall on or beside: a single wrong one must not light an emitter."""
-    near = cv2.boxFilter(counts.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    side = 2 * gap + 1
+    near = cv2.boxFilter(counts.astype(np.float32), -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
     return (counts > 0) & (near >= _DENSITY)
 
 
-def _close(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _close(mask: NDArray[np.bool_], gap: int) -> NDArray[np.bool_]:
     # A border of its own: closing must not lose what touches the picture's edge.
-    padded = cv2.copyMakeBorder(mask.astype(np.uint8), 4, 4, 4, 4, cv2.BORDER_REPLICATE)
-    return np.asarray(cv2.morphologyEx(padded, cv2.MORPH_CLOSE, _disc(2))[4:-4, 4:-4] > 0)
+    reach = gap + 1
+    edge = 2 * reach
+    padded = cv2.copyMakeBorder(mask.astype(np.uint8), edge, edge, edge, edge, cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.morphologyEx(padded, cv2.MORPH_CLOSE, _disc(reach))[edge:-edge, edge:-edge] > 0)
 
 
 def _disc(radius: int) -> NDArray[np.uint8]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel
 
-from drivers import SteppedBench
+from drivers import BenchKind, SteppedBench
 from sim_backend.clock import VirtualClock
 from sim_backend.settings import SimulatedSettings
 
@@ -64,5 +64,5 @@ def truth_of(settings: SimulatedSettings) -> Truth:
     return Truth(Optics.of(settings, transport_of(settings)), settings.rig())
 
 
-kind = SimulatedBenchKind()
+kind: BenchKind = SimulatedBenchKind()
 """What the entry point names."""

@@ -43,7 +43,7 @@ def transport_of(settings: SimulatedSettings) -> Transport:
     if path.exists():
         try:
             # Reading a zip member checks its CRC-32: a damaged file does not pass.
-            with np.load(path, allow_pickle=False) as stored:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                 transport = Transport.from_arrays({name: stored[name] for name in stored.files})
             os.utime(path)
             return transport

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ive
 
 from drivers import FrameFormat, NoiseModel, Pixels
 from sim_backend.kernels import Floats
@@ -133,6 +134,16 @@ class Sensor:
 def _blurred(picture: Floats, sigma_px: float) -> Floats:
     if sigma_px == 0:
         return picture
-    # Beyond four standard deviations a Gaussian holds less than 1e-4 of its weight.
-    width = 2 * math.ceil(4 * sigma_px) + 1
-    return np.asarray(cv2.GaussianBlur(picture, (width, width), sigma_px, borderType=cv2.BORDER_REPLICATE), np.float32)
+    kernel = _gaussian(sigma_px)
+    return np.asarray(cv2.sepFilter2D(picture, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE), np.float32)
+
+
+@cache
+def _gaussian(sigma_px: float) -> Floats:
+    """Kernel of a Gaussian on a grid: e^(-σ²) I_n(σ²), whose variance is σ² even for narrow ones.
+
+    A sampled Gaussian of σ = 0.5 px is 14 % too small there (Lindeberg, IEEE TPAMI 12(3), 1990).
+    """
+    reach = math.ceil(4 * sigma_px) + 1
+    kernel = ive(np.abs(np.arange(-reach, reach + 1)), sigma_px**2)
+    return np.asarray(kernel / kernel.sum(), np.float32)

@@ -34,7 +34,7 @@ from sim_backend.viewpoint import Viewpoint, bilinear_shares
 
 _PIXELS_AT_ONCE = 40_000
 _PATHS_AT_ONCE = 50_000
-_PILOT_STEP_PX = 8
+_PILOT_PHOTONS = 20_000
 _SPACING = 0.6
 """Photons at most this far apart, in cells, leave ripples of a few per cent."""
 _GRID_VARIANCE = 5 / 12
@@ -190,9 +190,7 @@ def _resolution(
     light more than the lobe, the surface is traced as a mirror.
     """
     materials = [surface.material for surface in bounces.caster.surfaces]
-    pilot = np.zeros_like(lit)
-    pilot[::_PILOT_STEP_PX, ::_PILOT_STEP_PX] = lit[::_PILOT_STEP_PX, ::_PILOT_STEP_PX]
-    found = bounces.trace(materials, pilot, number, 0, settings.specular_bounces)
+    found = bounces.trace(materials, lit, number, _PILOT_PHOTONS, settings.specular_bounces)
     spread = float(np.median(found.lobe_px)) if found.lobe_px.size else 0.0
     widest = spread / math.sqrt(_GRID_VARIANCE)
     coarse = 2 ** math.floor(math.log2(widest)) if widest >= 1 else 0
@@ -257,8 +255,8 @@ class _Bounces:
         materials
             How the surfaces scatter, by number.
         lit
-            (height, width) bool of the projector. Each pixel sends out at least one photon, and as many as there are
-            squares in the finest grid on it that the number of photons allows.
+            (height, width) bool of the projector. Each pixel sends out one photon from each square of a grid, as fine
+            as the number of photons allows; if there are fewer photons than pixels, lot decides.
         surface
             Number of the surface that has to be met first, and bounces over mirrors and lobes; None for any surface,
             and bounces with a diffuse reflection.
@@ -268,6 +266,9 @@ class _Bounces:
         # One pixel more all round, because the picture of an edge falls between pixel centres.
         row, column = np.nonzero(cv2.dilate(lit.astype(np.uint8), np.ones((3, 3), np.uint8)))
         squares = max(1, math.isqrt(photons // max(1, row.size)))
+        chance = min(1.0, photons / max(1, row.size))
+        chosen = np.random.default_rng(0).random(row.size) < chance
+        row, column = row[chosen], column[chosen]
         at_once = max(1, _PATHS_AT_ONCE // squares**2)
 
         def batch(first: int) -> _Arrivals:
@@ -282,7 +283,7 @@ class _Bounces:
                 self.caster,
                 self.projector,
                 here.reshape(-1, 2),
-                1 / squares**2,
+                1 / (squares**2 * chance),
                 choice.reshape(-1, 2),
                 surface,
             )

@@ -2,7 +2,8 @@
 
 Round one projects nine slightly different frequencies on each axis. Where the fringes of a pixel do not fit one path, a
 bounce arrives; there the two paths are separated. Round two lights only where the direct light of those pixels comes
-from, so that the bounce has no source. Inside the region the better of both answers is kept, if it passes its own test.
+from, so that the bounce has no source. Inside the region round two is kept where it passes its own test, else the
+separation where it is clear.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from scanner.methods.multi_frequency import DecodedAxis, decode_axes, one_path_m
 from scanner.paths import choose_direct, separate_two_paths
 from scanner.patterns import Axis, Plan
 from scanner.phasors import RoundPhasors
-from scanner.regions import continued, inside, lit_together, literal_mask, sound_mask
+from scanner.regions import continued, inside, lit_together, literal_mask, pitch, sound_mask
 from scanner.result import Flag, Maps
 from scanner.rig import Rig
 from scanner.triangulation import triangulate
@@ -200,10 +201,11 @@ class MicroFrequencyShifting:
             np.append(u[chosen], continued(u, chosen, between) if a in s.u else nothing[between])
             for a, u in (("x", x), ("y", y))
         ]
-        return sound_mask(direct[0], direct[1], size, margin_px, (bounce_x[chosen], bounce_y[chosen]))
+        emitters = bounce_x[chosen], bounce_y[chosen]
+        return sound_mask(direct[0], direct[1], size, margin_px, emitters, pitch(x, y))
 
     def fuse(self, first: FirstRound, second: RoundFrames, setup: Setup) -> Maps:
-        """Inside the region round two where it passes, else the separated paths where these are clear; outside, round one.
+        """Inside the region round two where it passes, else the separated paths where clear; outside, round one.
 
         Round two goes first even where the separation predicts the smaller σ: it removed the bounce, the separation has
         to assume how many there are, and where both paths nearly coincide its σ says little.

@@ -14,7 +14,7 @@ from sim_backend.truth import Truth
 
 SMALL = {
     "camera": {"width_px": 256, "height_px": 192},
-    "transport": {"photons": 400_000},
+    "transport": {"photons": 200_000},
 }
 
 

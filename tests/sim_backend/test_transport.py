@@ -116,7 +116,7 @@ def test_direct_light_has_the_radiance_of_a_lambertian_surface(truth):
 
 
 def test_sphere_is_dark_beyond_the_terminator(truth):
-    found = truth(scene={"name": "sphere", "radius_mm": 60.0}, baseline_mm=400.0)
+    found = truth(scene={"name": "sphere", "radius_mm": 60.0}, baseline_mm=700.0)
     centre = np.array([0.0, 0.0, 600.0])
     rays = _pixel_rays(found.rig.camera)
     rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -170,7 +170,7 @@ def test_bounce_of_a_plane_mirror_is_light_of_the_mirrored_projector(truth, chan
     offset = crossing - mirror.centre
     inside = np.maximum(*(np.abs(offset @ h) / (h @ h) for h in (mirror.half_width, mirror.half_height)))
     on_board = (found.object_id == 0) & ~found.edge
-    region, outside = (inside < 0.94) & on_board, (inside > 1.06) & on_board
+    region, outside = (inside < 0.93) & on_board, (inside > 1.1) & on_board
 
     assert region.mean() > 0.08
     assert np.isfinite(found.bounce_x[region]).all()
@@ -196,7 +196,8 @@ def test_a_bounce_never_exceeds_what_arrived(small):
     transport = trace([wall, MIRROR], rig, settings.transport)
     points = _on_plane(_pixel_rays(rig.camera), wall)
     area = _pixel_areas(rig, points, wall.normal)
-    on_wall = transport.view.surface == 0
+    # Pixels at the mirror's rim see a little of what it shows.
+    on_wall = (transport.view.surface == 0) & ~transport.view.mixed
     received = (transport.bounced_light(WHITE) * math.pi / 0.5 * area)[on_wall].sum()
     # Projector pixels whose centre rays meet the mirror, by geometry alone.
     px = np.stack(np.meshgrid(np.arange(1280), np.arange(800)), -1) + 0.0
@@ -284,7 +285,7 @@ def test_diffuse_exchange_of_opposed_squares_is_as_the_form_factor_says():
 
 
 def test_diffuse_bounce_in_a_groove_carries_the_radiance_of_its_patches(truth):
-    """After one bounce the right face has light of the left one only:  a sum over patches, E = Σ ρ/π E_i cos θ cos θ_i / r² dA_i."""
+    """The right face gets light of the left one only: E = Σ ρ/π E_i cos θ cos θ_i / r² dA_i over its patches."""
     matt = {"reflectance": 0.7, "gloss": 0.0}
     scene = {"name": "v_groove", "finish": matt, "opening_deg": 90.0, "pitch_deg": 0.0}
     found = truth(scene=scene, transport={"diffuse_bounces": 1, "photons": 2_000_000})
@@ -314,7 +315,7 @@ def test_diffuse_bounce_in_a_groove_carries_the_radiance_of_its_patches(truth):
 
 def test_a_lobe_blurs_fringes_as_its_breadth_says(small):
     """A mirror of roughness r dims a fringe of the bounce by the Gaussian's transfer function."""
-    settings = small(transport={"photons": 1_500_000})
+    settings = small(transport={"photons": 600_000})
     rig = settings.rig()
     wall = Rectangle(np.array([-20, 0, 620.0]), np.array([160.0, 0, 0]), np.array([0, 125.0, 0]), Material(0.5))
     points = _on_plane(_pixel_rays(rig.camera), wall)

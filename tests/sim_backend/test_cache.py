@@ -1,0 +1,122 @@
+import os
+
+import numpy as np
+import pytest
+
+from sim_backend import cache
+from sim_backend.cache import transport_of
+from sim_backend.settings import SimulatedSettings
+
+
+@pytest.fixture
+def settings(tmp_path):
+    def make(scene="sphere", **changes):
+        return SimulatedSettings.model_validate(
+            {
+                "scene": {"name": scene},
+                "camera": {"width_px": 64, "height_px": 48},
+                "projector": {"width_px": 160, "height_px": 100},
+                "transport": {"photons": 10_000, "supersample": 1},
+                "cache_dir": tmp_path / "cache",
+                **changes,
+            }
+        )
+
+    return make
+
+
+@pytest.fixture
+def traced(monkeypatch):
+    """How often light has been traced."""
+    calls = []
+    original = cache.trace
+    monkeypatch.setattr(cache, "trace", lambda *a: calls.append(1) or original(*a))
+    return calls
+
+
+def _same(a, b):
+    left, right = a.to_arrays(), b.to_arrays()
+    assert left.keys() == right.keys()
+    for name in left:
+        np.testing.assert_array_equal(left[name], right[name], err_msg=name)
+        assert left[name].dtype == right[name].dtype
+
+
+@pytest.mark.parametrize("scene", ["sphere", "mirror", "v_groove"])
+def test_a_hit_gives_the_very_same_matrices(settings, traced, scene):
+    first, second = transport_of(settings(scene)), transport_of(settings(scene))
+    assert len(traced) == 1
+    _same(first, second)
+    light = np.random.default_rng(0).random((100, 160), np.float32)
+    np.testing.assert_array_equal(first.direct_light(light), second.direct_light(light))
+    np.testing.assert_array_equal(first.bounced_light(light), second.bounced_light(light))
+
+
+def test_tracing_is_deterministic(settings, tmp_path):
+    _same(transport_of(settings("v_groove")), transport_of(settings("v_groove", cache_dir=tmp_path / "other")))
+
+
+def _entry(folder):
+    (path,) = folder.glob("transport-*.npz")
+    return path
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "empty", "text"])
+def test_a_damaged_entry_is_traced_again(settings, traced, tmp_path, damage, caplog):
+    first = transport_of(settings())
+    path = _entry(tmp_path / "cache")
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0x10
+    path.write_bytes(
+        {"flip": bytes(content), "cut": bytes(content[:-500]), "empty": b"", "text": b"not a cache"}[damage]
+    )
+    _same(first, transport_of(settings()))
+    assert len(traced) == 2
+    assert "damaged" in caplog.text
+    _same(first, transport_of(settings()))
+    assert len(traced) == 2
+
+
+def test_only_what_changes_the_light_is_traced_again(settings, traced):
+    transport_of(settings())
+    transport_of(settings(seed=7, settle_s=0.1, faults={"drop_at": [3]}))
+    transport_of(settings(camera={"width_px": 64, "height_px": 48, "exposure_us": 5000.0, "blur_px": 1.0}))
+    assert len(traced) == 1
+    transport_of(settings(baseline_mm=150.0))
+    transport_of(settings(scene="plane"))
+    assert len(traced) == 3
+
+
+def test_cache_keeps_its_size(settings, tmp_path):
+    transport_of(settings())
+    size = _entry(tmp_path / "cache").stat().st_size
+    limit_mb = 1 + size // 1_000_000
+    for age, baseline in enumerate(range(100, 160, 10)):
+        transport_of(settings(baseline_mm=float(baseline), cache_limit_mb=limit_mb))
+        for path in (tmp_path / "cache").glob("transport-*.npz"):
+            os.utime(path, (path.stat().st_atime, path.stat().st_mtime - 10 * age))
+    entries = list((tmp_path / "cache").iterdir())
+    assert len(entries) >= 1
+    assert sum(path.stat().st_size for path in entries) <= limit_mb * 1_000_000
+
+
+def test_no_room_no_cache(settings, traced, tmp_path):
+    transport_of(settings(cache_limit_mb=0))
+    transport_of(settings(cache_limit_mb=0))
+    assert len(traced) == 2
+    assert not (tmp_path / "cache").exists()
+
+
+def test_a_folder_that_cannot_be_written_costs_time_only(settings, traced, tmp_path, caplog):
+    (tmp_path / "file").write_text("in the way")
+    transport_of(settings(cache_dir=tmp_path / "file" / "cache"))
+    assert len(traced) == 1
+    assert "cannot be cached" in caplog.text
+
+
+def test_environment_names_the_folder_unless_the_settings_do(settings, tmp_path, monkeypatch):
+    monkeypatch.setenv("MFS_SCANNER_CACHE", str(tmp_path / "by-environment"))
+    transport_of(settings(cache_dir=None))
+    assert _entry(tmp_path / "by-environment").exists()
+    transport_of(settings())
+    assert _entry(tmp_path / "cache").exists()
