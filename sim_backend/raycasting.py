@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import libusb_package
 import numpy as np
 from numpy.typing import NDArray
 
-# Open3D's wheel wants a libusb from the system; this wheel's serves as well, once it is loaded for all to see.
-ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+from drivers.libusb import load_libusb
+
+load_libusb()  # before Open3D, which needs it
 import open3d as o3d  # noqa: E402
 
 from sim_backend.kernels import meet  # noqa: E402

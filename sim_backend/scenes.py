@@ -195,7 +195,7 @@ class _Board(Pose):
     mirror_gap_mm: float = Field(
         15.0, ge=0, le=1000, description="Gap between the board's right edge and the mirror, mm."
     )
-    mirror_reflectance: Share = Field(0.75, description="Share of the light that the mirror reflects.")
+    mirror_reflectance: Share = Field(0.6, description="Share of the light that the mirror reflects.")
     mirror_roughness: Share = Field(
         0.0, description="0 a perfect mirror; else its lobe's standard deviation is √2·roughness² rad."
     )

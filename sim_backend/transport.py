@@ -37,8 +37,8 @@ _PATHS_AT_ONCE = 50_000
 _PILOT_PHOTONS = 20_000
 _SPACING = 0.6
 """Photons at most this far apart, in cells, leave ripples of a few per cent."""
-_GRID_VARIANCE = 5 / 12
-"""How much gathering light in blocks and cells of width c spreads it, in c²: two linear interpolations and a box."""
+_LEAST_LOBE_PX = 0.5
+"""Lobes that spread light by less than this on the camera's picture are traced as mirrors."""
 _LEAST_MASS = 0.05
 """Cells that hold less of a surface than this share get no more radiance than such a share would."""
 
@@ -159,12 +159,9 @@ def trace(surfaces: Sequence[Surface], rig: Rig, settings: TransportSettings) ->
     lit = _first_surfaces(caster, projector)
     for number, surface in enumerate(surfaces):
         if surface.material.specular:
-            coarse, materials = _resolution(bounces, lit == number, number, settings)
+            cell_px, block_px, materials = _resolution(bounces, lit == number, number, settings)
             found = bounces.trace(materials, lit == number, number, settings.photons, settings.specular_bounces)
-            if coarse:
-                bounced += bounces.gathered(found, coarse, coarse)
-            else:
-                bounced += bounces.gathered(found, max(1, math.ceil(_spacing_px(found) / _SPACING)), None)
+            bounced += bounces.gathered(found, cell_px, block_px)
     as_they_are = [surface.material for surface in surfaces]
     if any(material.diffuse for material in as_they_are):
         found = bounces.trace(as_they_are, lit != MISS, None, settings.photons, settings.diffuse_bounces)
@@ -182,23 +179,47 @@ def trace(surfaces: Sequence[Surface], rig: Rig, settings: TransportSettings) ->
 
 def _resolution(
     bounces: _Bounces, lit: NDArray[np.bool_], number: int, settings: TransportSettings
-) -> tuple[int, list[Material]]:
-    """How coarsely to gather the light that surface ``number`` reflects, px, 0 for not at all, and with what lobe.
+) -> tuple[int, int | None, list[Material]]:
+    """How coarsely to gather the light that surface ``number`` reflects, and with what lobe to trace it.
 
-    Wide cells keep the noise of single photons down. They spread the light themselves: the widest that do not do so
-    more than the lobe are taken, and the lobe that is traced is narrower by as much. Where even single pixels spread
-    light more than the lobe, the surface is traced as a mirror.
+    Wide cells and blocks keep the noise of single photons down, but spread the light themselves. So the widest are
+    taken that do not do so more than the lobe, and the lobe that is traced is narrower by as much.
+
+    Returns
+    -------
+    Width of the cells, px; width of the blocks, px, None for single pixels with their spots; the materials.
     """
     materials = [surface.material for surface in bounces.caster.surfaces]
-    found = bounces.trace(materials, lit, number, _PILOT_PHOTONS, settings.specular_bounces)
-    spread = float(np.median(found.lobe_px)) if found.lobe_px.size else 0.0
-    widest = spread / math.sqrt(_GRID_VARIANCE)
-    coarse = 2 ** math.floor(math.log2(widest)) if widest >= 1 else 0
-    narrower = math.sqrt(1 - (coarse / widest) ** 2) if coarse else 0.0
+    pilot = bounces.trace(materials, lit, number, _PILOT_PHOTONS, settings.specular_bounces)
+    photons_apart = _spacing_px(pilot)
+    pixel = photons_apart * math.sqrt(_photons_per_pixel(lit, _PILOT_PHOTONS))  # camera px from one pixel to the next
+    lobe = float(np.median(pilot.lobe_px)) if pilot.lobe_px.size else 0.0
+    if lobe < _LEAST_LOBE_PX:
+        materials[number] = replace(materials[number], roughness=0.0)
+        apart = pixel / math.sqrt(_photons_per_pixel(lit, settings.photons))
+        return max(1, math.ceil(apart / _SPACING)), None, materials
+
+    def widened(cell: int) -> float:
+        """Variance, px², beyond that of cells of one pixel (1/6 for sharing) and spots (1/3 of projector px²)."""
+        sharing_and_interpolating = cell**2 / 6 * (1 if cell == 1 else 2)
+        return sharing_and_interpolating - 1 / 6 + pixel**2 * (_block(cell, pixel) ** 2 / 12 - 1 / 3)
+
+    cell = max(c for c in (1, 2, 4, 8, 16, 32) if c == 1 or widened(c) <= lobe**2)
     # The lobe's breadth goes with the square of the roughness.
-    roughness = materials[number].roughness * math.sqrt(narrower)
-    materials[number] = replace(materials[number], roughness=roughness)
-    return coarse, materials
+    narrower = max(0.0, 1 - widened(cell) / lobe**2) ** 0.25
+    materials[number] = replace(materials[number], roughness=materials[number].roughness * narrower)
+    return cell, _block(cell, pixel), materials
+
+
+def _block(cell_px: int, pixel: float) -> int:
+    """Projector pixels that a cell is wide, where a projector pixel is ``pixel`` camera pixels wide."""
+    return max(1, round(cell_px / max(pixel, 1e-3)))
+
+
+def _photons_per_pixel(lit: NDArray[np.bool_], photons: int) -> float:
+    """How many photons each of the projector pixels ``lit`` sends out: a square number, or a chance below one."""
+    pixels = max(1, int(np.count_nonzero(lit)))
+    return float(math.isqrt(photons // pixels) ** 2) or photons / pixels
 
 
 def _first_surfaces(caster: RayCaster, projector: Viewpoint) -> NDArray[np.int8]:
@@ -265,9 +286,9 @@ class _Bounces:
         """
         # One pixel more all round, because the picture of an edge falls between pixel centres.
         row, column = np.nonzero(cv2.dilate(lit.astype(np.uint8), np.ones((3, 3), np.uint8)))
-        squares = max(1, math.isqrt(photons // max(1, row.size)))
-        chance = min(1.0, photons / max(1, row.size))
-        chosen = np.random.default_rng(0).random(row.size) < chance
+        per_pixel = _photons_per_pixel(lit, photons)
+        squares = max(1, math.isqrt(int(per_pixel)))
+        chosen = np.random.default_rng(0).random(row.size) < per_pixel
         row, column = row[chosen], column[chosen]
         at_once = max(1, _PATHS_AT_ONCE // squares**2)
 
@@ -283,7 +304,7 @@ class _Bounces:
                 self.caster,
                 self.projector,
                 here.reshape(-1, 2),
-                1 / (squares**2 * chance),
+                1 / per_pixel,
                 choice.reshape(-1, 2),
                 surface,
             )
@@ -297,7 +318,9 @@ class _Bounces:
         diffuse = np.array([s.material.diffuse for s in self.caster.surfaces])[photons.surface]
         xy = self.camera.project(photons.point)
         density = self.camera.density(xy, photons.point, photons.normal)
-        at = np.flatnonzero((density > 0) & (diffuse > 0) & (photons.flux > 0))
+        with np.errstate(invalid="ignore"):
+            in_picture = ((xy >= -0.5) & (xy < np.array(self.camera.lens.size) - 0.5)).all(1)
+        at = np.flatnonzero(in_picture & (density > 0) & (diffuse > 0) & (photons.flux > 0))
         at = at[self.caster.visible(photons.point[at], photons.normal[at], self.camera.centre)]
         # Radiance of a Lambertian pixel: flux times reflectance over the area a pixel sees, over π.
         weight = photons.flux[at] * diffuse[at] * density[at] / math.pi

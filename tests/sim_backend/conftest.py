@@ -14,6 +14,7 @@ from sim_backend.truth import Truth
 
 SMALL = {
     "camera": {"width_px": 256, "height_px": 192},
+    "projector": {"width_px": 640, "height_px": 400},
     "transport": {"photons": 200_000},
 }
 

@@ -11,7 +11,7 @@ from sim_backend.bench import kind
 from sim_backend.settings import SimulatedSettings
 
 QUIET = {"read_noise_dn": 0.0, "ambient_dn": 0.0}
-PICTURES = [np.full((800, 1280), level, np.uint8) for level in (255, 0, 128)]
+PICTURES = [np.full((400, 640), level, np.uint8) for level in (255, 0, 128)]
 
 
 def _shoot(bench, indices):
@@ -30,7 +30,7 @@ def test_bench_exposes_the_pattern_that_is_asked_for(small):
     with kind.open(small(scene={"name": "plane"}, camera=QUIET)) as bench:
         assert isinstance(bench, Bench)
         assert bench.simulated
-        assert bench.projector_size == (1280, 800)
+        assert bench.projector_size == (640, 400)
         bench.prepare(PICTURES)
         # Exposures fall on changing phases of the projector's refresh.
         order = [0, 1, 2] * 7
@@ -98,7 +98,7 @@ def test_bench_knows_its_format_noise_and_rig(small, bits):
         rig = Rig.from_json(bench.rig)
     # Both axes meet at the convergence distance.
     on_axis = rig.projector.project(rig.to_projector_frame([[0.0, 0.0, 600.0]]))
-    np.testing.assert_allclose(on_axis, [[639.5, 399.5]], atol=1e-6)
+    np.testing.assert_allclose(on_axis, [[319.5, 199.5]], atol=1e-6)
     np.testing.assert_allclose(rig.projector_centre_cam, [-180, 0, 0], atol=1e-9)
 
 

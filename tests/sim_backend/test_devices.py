@@ -18,12 +18,14 @@ from sim_backend.devices import SimulatedCamera, SimulatedProjector
 from sim_backend.optics import Optics
 from sim_backend.settings import FaultSettings, ProjectorSettings
 
-BLACK, GREY, WHITE = (np.full((800, 1280), level, np.uint8) for level in (0, 128, 255))
+BLACK, GREY, WHITE = (np.full((400, 640), level, np.uint8) for level in (0, 128, 255))
 
 
 @pytest.fixture
 def projector():
-    device = SimulatedProjector(ProjectorSettings(refresh_hz=50.0, latency_s=0.03), VirtualClock())
+    device = SimulatedProjector(
+        ProjectorSettings(width_px=640, height_px=400, refresh_hz=50.0, latency_s=0.03), VirtualClock()
+    )
     device.open()
     device.configure()
     return device
@@ -101,7 +103,7 @@ def test_a_picture_that_never_came_on_is_replaced(projector):
 
 
 def test_projector_refuses_illegal_calls():
-    device = SimulatedProjector(ProjectorSettings(), VirtualClock())
+    device = SimulatedProjector(ProjectorSettings(width_px=640, height_px=400), VirtualClock())
     with pytest.raises(IllegalCallError, match=r"darken\(\).*CLOSED"):
         device.darken()
     with pytest.raises(IllegalCallError, match=r"arm\(\).*CLOSED"):

@@ -11,7 +11,7 @@ def plane(truth):
 
 
 def _picture(level):
-    return np.full((800, 1280), level, np.uint8)
+    return np.full((400, 640), level, np.uint8)
 
 
 def _frames(settings, grey, count, seed=0):
@@ -50,7 +50,7 @@ def test_blurs_dim_fringes_as_a_gaussian_does(plane, sigma):
     """Transfer function of a Gaussian: exp(-2 π² σ² f²)."""
     optics = plane(projector={"blur_px": sigma}, camera={"blur_px": sigma})
     continuous = np.exp(-2 * (np.pi * sigma / 16) ** 2)
-    for blurred, shape in ((optics.projector_blurred, (800, 1280)), (optics.camera_blurred, (192, 256))):
+    for blurred, shape in ((optics.projector_blurred, (400, 640)), (optics.camera_blurred, (192, 256))):
         fringe = np.tile(np.cos(2 * np.pi * np.arange(shape[1]) / 16), (shape[0], 1)).astype(np.float32)
         inner = (slice(30, -30), slice(30, -30))
         # On a grid the exponent differs by 1.3 % at this frequency: cos ω - 1 in place of -ω²/2.

@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
 
+FULL = {"width_px": 1280, "height_px": 800}
+
 
 def _decoded(truth, axis, period=16, steps=12):
     """Projector coordinate modulo the period, px, from N-step pictures without noise, rounding or 8-bit patterns."""
@@ -34,7 +36,7 @@ def test_clean_plane_decodes_to_the_truth(truth, axis):
 
 def test_default_mirror_scene_is_the_experiment_it_should_be(truth):
     """Region, strength and reach of the bounce; no saturation where both paths add up."""
-    found = truth(scene={"name": "mirror"})
+    found = truth(scene={"name": "mirror"}, projector=FULL)
     region = found.alpha > 0.02
     inner = region & ~found.edge & np.isfinite(found.bounce_x)
     assert region.mean() > 0.08
@@ -58,7 +60,7 @@ def test_default_mirror_scene_is_the_experiment_it_should_be(truth):
 def test_matt_board_is_well_exposed_by_default(truth):
     """A and B of a fringe near 90 and 85 DN, in pixels as large as those of the default camera."""
     a_quarter = 2 * np.degrees(np.arctan(np.tan(np.radians(28.7 / 2)) / 4))
-    found = truth(scene={"name": "mirror_removed"}, camera={"field_of_view_deg": a_quarter})
+    found = truth(scene={"name": "mirror_removed"}, camera={"field_of_view_deg": a_quarter}, projector=FULL)
     white = found.optics.grey([(1.0, np.full((800, 1280), 255, np.uint8))]) - found.optics.camera.ambient_dn
     assert np.median(white) / 2 == pytest.approx(90, abs=4)
     assert np.median(found.direct_amplitude) == pytest.approx(85, abs=4)
@@ -114,6 +116,6 @@ def test_groove_faces_light_each_other(truth):
         strong = on_face & (found.alpha > 0.1)
         assert strong.sum() > 500
         # Light that reached this face by the other started beyond the fold.
-        fold = 639.5
+        fold = 319.5
         beyond = found.bounce_x[strong] > fold if face == 0 else found.bounce_x[strong] < fold
         assert beyond.mean() > 0.9
