@@ -81,7 +81,7 @@ def _store(transport: Transport, path: Path, limit_bytes: int) -> None:
     if sum(a.nbytes for a in arrays.values()) > limit_bytes:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix="transport-", suffix=".part", delete=False) as file:
         try:
             np.savez(file, allow_pickle=False, **arrays)
             file.close()
@@ -89,7 +89,7 @@ def _store(transport: Transport, path: Path, limit_bytes: int) -> None:
         except BaseException:
             Path(file.name).unlink(missing_ok=True)
             raise
-    kept = sorted(path.parent.glob("transport-*.npz"), key=lambda p: p.stat().st_mtime, reverse=True)
+    kept = sorted(path.parent.glob("transport-*"), key=lambda p: p.stat().st_mtime, reverse=True)
     total = 0
     for entry in kept:
         total += entry.stat().st_size

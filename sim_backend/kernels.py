@@ -111,6 +111,7 @@ def spread_spots(
         (width, height), px; spots outside are dark.
     """
     width, height = projector_size
+    u, v = np.ascontiguousarray(u), np.ascontiguousarray(v)  # so that the kernel is compiled once
     out_start, column, value = _spread(start, path, weight, u, v, width, height)
     # A copy, because the kernel's buffers are as long as the rows could have become.
     return SparseRows(out_start, column[: out_start[-1]].copy(), value[: out_start[-1]].copy())

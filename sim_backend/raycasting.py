@@ -74,7 +74,8 @@ class RayCaster:
         cast = self._scene.cast_rays(_rays(start, direction))
         # Open3D's number for "none" is the largest uint32, which becomes -1.
         surface = cast["geometry_ids"].numpy().astype(np.int16)
-        return Hits(surface, *meet(self._shapes, surface, np.broadcast_to(origin, direction.shape), direction))
+        begin = np.ascontiguousarray(np.broadcast_to(origin, direction.shape))
+        return Hits(surface, *meet(self._shapes, surface, begin, direction))
 
     def visible(self, point: Array, normal: Array, target: Array) -> NDArray[np.bool_]:
         """Whether nothing stands between points (n, 3), seen from the side of their normals, and ``target`` (3,)."""

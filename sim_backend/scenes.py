@@ -190,7 +190,7 @@ class _Board(Pose):
         lt=60,
         description="Turn of the mirror about its own horizontal middle line; sends the bounce up, °.",
     )
-    mirror_width_mm: Length = Field(85.0, description="Length of the mirror away from the board, mm.")
+    mirror_width_mm: Length = Field(75.0, description="Length of the mirror away from the board, mm.")
     mirror_height_mm: Length = Field(150.0, description="Height of the mirror along the board's edge, mm.")
     mirror_gap_mm: float = Field(
         15.0, ge=0, le=1000, description="Gap between the board's right edge and the mirror, mm."

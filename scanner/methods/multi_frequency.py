@@ -72,8 +72,8 @@ class MultiFrequency:
         return None
 
     def fuse(self, first: FirstRound, second: RoundFrames, setup: Setup) -> Maps:
-        """Nothing to join."""
-        raise NotImplementedError(f"{self.name} has one round")
+        """Nothing follows, so round one stands."""
+        return first.maps
 
 
 temporal_phase_shifting = MultiFrequency("tps", lambda extent: (1 / 16, 10 / extent, 1 / extent))

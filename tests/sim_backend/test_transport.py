@@ -172,7 +172,7 @@ def test_bounce_of_a_plane_mirror_is_light_of_the_mirrored_projector(truth, chan
     on_board = (found.object_id == 0) & ~found.edge
     region, outside = (inside < 0.93) & on_board, (inside > 1.1) & on_board
 
-    assert region.mean() > 0.08
+    assert region.mean() > 0.05
     assert np.isfinite(found.bounce_x[region]).all()
     assert np.isnan(found.bounce_x[outside]).all()
     error = np.stack((found.bounce_x, found.bounce_y), -1)[region] - px[region]
