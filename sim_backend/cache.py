@@ -49,6 +49,7 @@ def transport_of(settings: SimulatedSettings) -> Transport:
             return transport
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             _log.warning("cached light transport %s is damaged (%s) and is traced again", path, error)
+    _log.info("tracing the light of scene %s, once", settings.scene.name)
     transport = trace(settings.scene.surfaces(), settings.rig(), settings.transport)
     try:
         _store(transport, path, settings.cache_limit_mb * 1_000_000)

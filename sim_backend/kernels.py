@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numba import njit
@@ -53,15 +53,18 @@ class SparseRows:
         return np.concatenate(list(in_parallel(lambda block: block @ x[: block.shape[1]], self._blocks)))
 
     @cached_property
-    def _blocks(self) -> list[sparse.csr_array]:
+    def _blocks(self) -> list[Any]:
         """Views of some rows each, one for a core at a time."""
         columns = int(self.column.max(initial=0)) + 1
         blocks = []
         for first in range(0, self.start.size - 1, _ROWS_AT_ONCE):
             start = self.start[first : first + _ROWS_AT_ONCE + 1]
             a, b = start[0], start[-1]
-            entries = self.value[a:b], self.column[a:b], (start - a).astype(np.int32)
-            blocks.append(sparse.csr_array(entries, shape=(start.size - 1, columns)))
+            block = sparse.csr_array((start.size - 1, columns), dtype=np.float32)
+            # Set one by one, because the constructor copies views.
+            block.data, block.indices = self.value[a:b], self.column[a:b]
+            block.indptr = (start - a).astype(np.int32)
+            blocks.append(block)
         return blocks
 
     @classmethod

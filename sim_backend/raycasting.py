@@ -74,7 +74,7 @@ class RayCaster:
         cast = self._scene.cast_rays(_rays(start, direction))
         # Open3D's number for "none" is the largest uint32, which becomes -1.
         surface = cast["geometry_ids"].numpy().astype(np.int16)
-        begin = np.ascontiguousarray(np.broadcast_to(origin, direction.shape))
+        begin = np.array(np.broadcast_to(origin, direction.shape), order="C")
         return Hits(surface, *meet(self._shapes, surface, begin, direction))
 
     def visible(self, point: Array, normal: Array, target: Array) -> NDArray[np.bool_]:

@@ -6,7 +6,7 @@ A projector pixel that is fully on sends out a flux of 1; the camera pixel's val
 - light seen in mirrors: rays from the camera as well;
 - bounces: photons from the projector, `sim_backend.projector_paths`, gathered in cells of the camera's picture, cells
   of one surface apart from those of another. Light that comes over mirrors keeps the projector's single pixels apart;
-  for lobes and diffuse reflections blocks of projector pixels suffice, and cells as coarse as the lobe is bounce.
+  for lobes and diffuse reflections blocks of projector pixels suffice, and cells as coarse as the lobe is broad.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from sim_backend.settings import TransportSettings
 from sim_backend.surfaces import Array, Material, Surface
 from sim_backend.viewpoint import Viewpoint, bilinear_shares
 
-_PIXELS_AT_ONCE = 40_000
 _PATHS_AT_ONCE = 50_000
 _PILOT_PHOTONS = 20_000
 _SPACING = 0.6
@@ -157,14 +156,18 @@ def trace(surfaces: Sequence[Surface], rig: Rig, settings: TransportSettings) ->
     bounces = _Bounces(caster, camera, projector, seen.view)
     bounced: list[Bounce] = []
     lit = _first_surfaces(caster, projector)
-    for number, surface in enumerate(surfaces):
-        if surface.material.specular:
-            cell_px, block_px, materials = _resolution(bounces, lit == number, number, settings)
-            found = bounces.trace(materials, lit == number, number, settings.photons, settings.specular_bounces)
-            bounced += bounces.gathered(found, cell_px, block_px)
-    as_they_are = [surface.material for surface in surfaces]
-    if any(material.diffuse for material in as_they_are):
-        found = bounces.trace(as_they_are, lit != MISS, None, settings.photons, settings.diffuse_bounces)
+    materials = [surface.material for surface in surfaces]
+    for number, material in enumerate(materials):
+        if material.specular:
+            here, most = lit == number, settings.specular_bounces
+            pilot = bounces.trace(materials, here, number, _PILOT_PHOTONS, most)
+            if pilot.u.size:
+                cell_px, block_px, lobe = bounces.resolution(pilot, here, settings.photons)
+                found = bounces.trace(_with_lobe(materials, number, lobe), here, number, settings.photons, most)
+                bounced += bounces.gathered(found, cell_px, block_px)
+    anywhere, most = lit != MISS, settings.diffuse_bounces
+    if bounces.trace(materials, anywhere, None, _PILOT_PHOTONS, most).u.size:
+        found = bounces.trace(materials, anywhere, None, settings.photons, most)
         block, cell = max(1, rig.projector.size[0] // 40), max(1, rig.camera.size[0] // 64)
         bounced += bounces.gathered(found, cell, block, diffuse=True)
     return Transport(
@@ -177,38 +180,12 @@ def trace(surfaces: Sequence[Surface], rig: Rig, settings: TransportSettings) ->
     )
 
 
-def _resolution(
-    bounces: _Bounces, lit: NDArray[np.bool_], number: int, settings: TransportSettings
-) -> tuple[int, int | None, list[Material]]:
-    """How coarsely to gather the light that surface ``number`` reflects, and with what lobe to trace it.
-
-    Wide cells and blocks keep the noise of single photons down, but spread the light themselves. So the widest are
-    taken that do not do so more than the lobe, and the lobe that is traced is narrower by as much.
-
-    Returns
-    -------
-    Width of the cells, px; width of the blocks, px, None for single pixels with their spots; the materials.
-    """
-    materials = [surface.material for surface in bounces.caster.surfaces]
-    pilot = bounces.trace(materials, lit, number, _PILOT_PHOTONS, settings.specular_bounces)
-    photons_apart = _spacing_px(pilot)
-    pixel = photons_apart * math.sqrt(_photons_per_pixel(lit, _PILOT_PHOTONS))  # camera px from one pixel to the next
-    lobe = float(np.median(pilot.lobe_px)) if pilot.lobe_px.size else 0.0
-    if lobe < _LEAST_LOBE_PX:
-        materials[number] = replace(materials[number], roughness=0.0)
-        apart = pixel / math.sqrt(_photons_per_pixel(lit, settings.photons))
-        return max(1, math.ceil(apart / _SPACING)), None, materials
-
-    def widened(cell: int) -> float:
-        """Variance, px², beyond that of cells of one pixel (1/6 for sharing) and spots (1/3 of projector px²)."""
-        sharing_and_interpolating = cell**2 / 6 * (1 if cell == 1 else 2)
-        return sharing_and_interpolating - 1 / 6 + pixel**2 * (_block(cell, pixel) ** 2 / 12 - 1 / 3)
-
-    cell = max(c for c in (1, 2, 4, 8, 16, 32) if c == 1 or widened(c) <= lobe**2)
+def _with_lobe(materials: Sequence[Material], number: int, factor: float) -> list[Material]:
+    """The materials, but the lobe of one by ``factor`` as broad."""
+    changed = list(materials)
     # The lobe's breadth goes with the square of the roughness.
-    narrower = max(0.0, 1 - widened(cell) / lobe**2) ** 0.25
-    materials[number] = replace(materials[number], roughness=materials[number].roughness * narrower)
-    return cell, _block(cell, pixel), materials
+    changed[number] = replace(materials[number], roughness=materials[number].roughness * math.sqrt(factor))
+    return changed
 
 
 def _block(cell_px: int, pixel: float) -> int:
@@ -313,6 +290,41 @@ class _Bounces:
 
         return _Arrivals.joined([_Arrivals.none(), *in_parallel(batch, range(0, row.size, at_once))])
 
+    def resolution(self, pilot: _Arrivals, lit: NDArray[np.bool_], photons: int) -> tuple[int, int | None, float]:
+        """How coarsely to gather the light that a surface reflects, and with what lobe to trace it.
+
+        Wide cells and blocks keep the noise of single photons down, but spread the light themselves. So the widest
+        are taken that do not do so more than the lobe, and the lobe that is traced is narrower by as much.
+
+        Parameters
+        ----------
+        pilot
+            Where a few photons of the pixels ``lit`` have arrived.
+        lit
+            (height, width) bool of the projector.
+        photons
+            How many there will be.
+
+        Returns
+        -------
+        Width of the cells, px; width of the blocks, px, None for single pixels with their spots; the share of its
+        breadth that the lobe is to have.
+        """
+        # From one projector pixel's light to the next one's, camera px.
+        pixel = _spacing_px(pilot, self.camera.lens.size) * math.sqrt(_photons_per_pixel(lit, _PILOT_PHOTONS))
+        lobe = float(np.median(pilot.lobe_px))
+        if lobe < _LEAST_LOBE_PX:
+            apart = pixel / math.sqrt(_photons_per_pixel(lit, photons))
+            return max(1, math.ceil(apart / _SPACING)), None, 0.0
+
+        def widened(cell: int) -> float:
+            """Variance, px², beyond that of cells of one pixel (1/6 for sharing) and spots (1/3 of projector px²)."""
+            sharing_and_interpolating = cell**2 / 6 * (1 if cell == 1 else 2)
+            return sharing_and_interpolating - 1 / 6 + pixel**2 * (_block(cell, pixel) ** 2 / 12 - 1 / 3)
+
+        cell = max(c for c in (1, 2, 4, 8, 16, 32) if c == 1 or widened(c) <= lobe**2)
+        return cell, _block(cell, pixel), math.sqrt(max(0.0, 1 - widened(cell) / lobe**2))
+
     def seen(self, photons: Photons) -> _Arrivals:
         """What the camera sees of photons that have arrived on matt surfaces."""
         diffuse = np.array([s.material.diffuse for s in self.caster.surfaces])[photons.surface]
@@ -358,13 +370,14 @@ class _Bounces:
         return bounces
 
 
-def _spacing_px(found: _Arrivals) -> float:
-    """How far photons lie apart in the camera's picture, by the number of them in squares of 16 px."""
+def _spacing_px(found: _Arrivals, camera_size: tuple[int, int]) -> float:
+    """How far photons lie apart in the camera's picture, by the number of them in squares of 1/64 of its width."""
     if found.x.size == 0:
         return 0.0
-    square = (found.y // 16).astype(np.int64) * 65536 + (found.x // 16).astype(np.int64)
+    side = camera_size[0] / 64
+    square = (found.y // side).astype(np.int64) * 64 + (found.x // side).astype(np.int64)
     _, which, count = np.unique(square, return_inverse=True, return_counts=True)
-    return float(16 / np.sqrt(np.median(count[which])))
+    return float(side / np.sqrt(np.median(count[which])))
 
 
 def _grid(squares: int) -> Array:

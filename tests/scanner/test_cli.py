@@ -319,6 +319,12 @@ def test_a_strangers_bench_is_found_by_its_entry_point(run, tmp_path):
     assert np.median(depth) == pytest.approx(1000, abs=1)
     assert "SIMULATED" not in done.stdout
 
+    # The same bench without a rig: refused before anything is projected.
+    text = (site / "stranger.py").read_text(encoding="utf-8")
+    (site / "stranger.py").write_text(text.replace("self.rig = Rig", "self.rig = None and Rig"), encoding="utf-8")
+    refused(run("--config", "mine.yaml", "--out", "none", PYTHONPATH=str(site)), "mine.yaml: rig", "flat wall")
+    assert not (tmp_path / "none").exists()
+
 
 def test_schema_is_json(run):
     done = run("schema")
