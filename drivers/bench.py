@@ -147,6 +147,7 @@ class SteppedBench:
             self.camera.start()
             if self.trigger is not None:
                 stack.callback(self.trigger.stop)
+                self.trigger.configure()
                 self.trigger.arm()
             # Last in, first out: whatever else happens on the way down, the projector goes dark first.
             stack.callback(self._darken_if_open)

@@ -148,6 +148,41 @@ class FrameStamp:
     t_shown_s: float = float("nan")
 
 
+@dataclass(frozen=True)
+class PlayRecord:
+    """What is known of a sequence that a projector has played by itself.
+
+    Parameters
+    ----------
+    shown_s
+        When each picture was handed to the display, s on the bench's clock.
+    late
+        Numbers (from 0) of the pictures that came one or more refreshes too late; empty for a good sequence.
+    """
+
+    shown_s: tuple[float, ...]
+    late: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class TriggerCounts:
+    """What a trigger box has counted since it was armed.
+
+    Parameters
+    ----------
+    sent
+        Pulses given to the camera.
+    exposed
+        Exposures that the camera reported back on its "exposure active" line; None where that line is not connected.
+    missed
+        Edges or requests that came too early to be answered with a pulse.
+    """
+
+    sent: int
+    exposed: int | None
+    missed: int
+
+
 @runtime_checkable
 class Clock(Protocol):
     """Where time comes from. Real benches use `drivers.clock.SystemClock`, simulated ones a virtual clock."""
@@ -262,17 +297,51 @@ class Projector(Device, Protocol):
 
 
 @runtime_checkable
-class Trigger(Device, Protocol):
-    """A box that gives trigger pulses to the camera."""
+class SequencePlayer(Projector, Protocol):
+    """A projector that shows a loaded sequence by itself, one picture per `period_s`: ``load → play → finish``."""
 
-    def arm(self) -> None:
-        """Get ready to fire."""
+    def play(self) -> None:
+        """Begin to show all loaded pictures once, in order, each for one period; returns at once."""
+        ...
+
+    def finish(self, timeout_s: float) -> PlayRecord:
+        """Wait until the last picture was shown for its period.
+
+        Raises
+        ------
+        SequenceFaultError
+            It was not within ``timeout_s``.
+        """
+        ...
+
+
+@runtime_checkable
+class Trigger(Device, Protocol):
+    """A box that gives trigger pulses to the camera. ``open → configure → (arm → fire* → counts → stop)* → close``."""
+
+    def configure(self) -> None:
+        """Apply the settings the box was made with."""
+        ...
+
+    def arm(self, pulses: int | None = None) -> None:
+        """Set the counts to 0 and get ready.
+
+        Parameters
+        ----------
+        pulses
+            None: one pulse for each `fire`. A number: one pulse for each of so many edges at the box's input, which
+            the projector or a light sensor makes; further edges are ignored.
+        """
         ...
 
     def fire(self) -> None:
-        """Give one pulse."""
+        """Give one pulse; returns when the box has confirmed it."""
+        ...
+
+    def counts(self) -> TriggerCounts:
+        """What was counted since the box was armed."""
         ...
 
     def stop(self) -> None:
-        """No more pulses."""
+        """No more pulses. Allowed in every state but CLOSED."""
         ...

@@ -6,6 +6,8 @@ command line ends with: 2 bad configuration or usage, 3 hardware, 4 the scan ran
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class OperatorError(Exception):
     """Base of all errors that are shown to a person instead of a traceback.
@@ -28,11 +30,53 @@ class OperatorError(Exception):
     def __str__(self) -> str:
         return f"{self.message}\n  → {self.remedy}"
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Errors travel between the processes of a bench; a subclass may be made of other arguments than these.
+        return _revived, (type(self), self.message, self.remedy)
+
+
+def _revived(kind: type[OperatorError], message: str, remedy: str) -> OperatorError:
+    error = kind.__new__(kind)
+    OperatorError.__init__(error, message, remedy)
+    return error
+
 
 class HardwareError(OperatorError):
-    """A device did not do what it was asked to."""
+    """A device did not do what it was asked to.
+
+    ``repeatable`` says whether the same sequence may succeed when it is taken again.
+    """
 
     exit_code = 3
+    repeatable = False
+
+
+class MissingLibraryError(HardwareError):
+    """A library that a driver stands on is not installed or cannot be loaded."""
+
+
+class DeviceNotFoundError(HardwareError):
+    """No device, or more than one, is what the configuration asks for; the message lists what is there."""
+
+
+class DeviceBusyError(HardwareError):
+    """Another process holds the device."""
+
+
+class ProtocolError(HardwareError):
+    """A device answered something that its protocol does not allow."""
+
+    repeatable = True
+
+
+class SequenceFaultError(HardwareError):
+    """The frames of a sequence cannot be trusted: counts disagree, a flip was late, a picture was missing."""
+
+    repeatable = True
+
+
+class FrameLossError(SequenceFaultError):
+    """Frames were lost or are incomplete."""
 
 
 class IllegalCallError(HardwareError):
@@ -46,11 +90,15 @@ class IllegalCallError(HardwareError):
 
 
 class DeviceLostError(HardwareError):
-    """A device that was there does not answer any more."""
+    """A device that was there does not answer any more; it is in FAULT until it is closed and opened again."""
+
+    repeatable = True
 
 
 class FrameTimeoutError(HardwareError):
     """A triggered frame did not arrive in time."""
+
+    repeatable = True
 
 
 class DeviceSettingError(HardwareError):
