@@ -1,6 +1,6 @@
 """What a device is, and the real ones. Knows nobody else."""
 
-from drivers.bench import Bench, BenchKind, SteppedBench
+from drivers.bench import Bench, BenchKind, LatencyBound
 from drivers.clock import SystemClock
 from drivers.devices import (
     Camera,
@@ -32,6 +32,9 @@ from drivers.errors import (
     ProtocolError,
     SequenceFaultError,
 )
+from drivers.latency import DisplayLatency
+from drivers.stepped import SteppedBench
+from drivers.streamed import StreamedBench
 
 __all__ = [
     "Bench",
@@ -44,12 +47,14 @@ __all__ = [
     "DeviceNotFoundError",
     "DeviceSettingError",
     "DeviceState",
+    "DisplayLatency",
     "FrameFormat",
     "FrameLossError",
     "FrameStamp",
     "FrameTimeoutError",
     "HardwareError",
     "IllegalCallError",
+    "LatencyBound",
     "Lifecycle",
     "MissingLibraryError",
     "NoiseModel",
@@ -61,6 +66,7 @@ __all__ = [
     "SequenceFaultError",
     "SequencePlayer",
     "SteppedBench",
+    "StreamedBench",
     "SystemClock",
     "Trigger",
     "TriggerCounts",

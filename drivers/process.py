@@ -13,7 +13,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
@@ -87,14 +88,15 @@ class DeviceProcess:
         self._process = context.Process(
             target=_serve, args=(commands, events, self._factory, self._args), name=self.device, daemon=True
         )
-        self._process.start()
+        with _no_interruption():
+            self._process.start()
         # The other ends belong to the child alone, so that its death is seen as the end of the pipe.
         commands.close()
         events.close()
         try:
             self._answer("start", timeout_s)
         except BaseException:
-            self.stop(0.0)
+            self.stop(2.0)
             raise
 
     def call(self, method: str, *args: Any, timeout_s: float = 10.0) -> Any:
@@ -107,13 +109,18 @@ class DeviceProcess:
         DeviceLostError
             The process has died, or did not answer within ``timeout_s``; then it is killed.
         """
-        if self._commands is None:
-            raise self._lost(f"{method}() was called on a process that is not running")
-        try:
-            self._commands.send((method, args))
-        except OSError:
-            raise self._died() from None
+        self._send(method, args, answered=True)
         return self._answer(method, timeout_s)
+
+    def post(self, method: str, *args: Any) -> None:
+        """Call a method of the server and go on at once; what it raises arrives as an event.
+
+        Raises
+        ------
+        DeviceLostError
+            The process has died.
+        """
+        self._send(method, args, answered=False)
 
     def next_event(self, timeout_s: float) -> Any:
         """Wait for the server's next message; None where there was none within ``timeout_s``.
@@ -144,6 +151,14 @@ class DeviceProcess:
             process.kill()
             process.join()
         process.close()
+
+    def _send(self, method: str, args: tuple[Any, ...], *, answered: bool) -> None:
+        if self._commands is None:
+            raise self._lost(f"{method}() was called on a process that is not running")
+        try:
+            self._commands.send((method, args, answered))
+        except OSError:
+            raise self._died() from None
 
     def _answer(self, method: str, timeout_s: float) -> Any:
         assert self._commands is not None
@@ -188,7 +203,7 @@ def _serve(commands: Connection, events: Connection, factory: Callable[..., Serv
         return
     try:
         commands.send((None, None))
-        _loop(commands, server)
+        _loop(commands, events.send, server)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the scan has let go
     finally:
@@ -196,17 +211,34 @@ def _serve(commands: Connection, events: Connection, factory: Callable[..., Serv
             server.close()
 
 
-def _loop(commands: Connection, server: Server) -> None:
+def _loop(commands: Connection, emit: Emit, server: Server) -> None:
     while True:
         patience = server.idle()
         if not wait([commands], patience):
             continue
-        method, args = commands.recv()
+        method, args, answered = commands.recv()
         try:
             answer: tuple[OperatorError | None, Any] = None, getattr(server, method)(*args)
         except Exception as error:
             answer = _portable(error, method), None
-        commands.send(answer)
+        if answered:
+            commands.send(answer)
+        elif answer[0] is not None:
+            emit(answer[0])
+
+
+@contextlib.contextmanager
+def _no_interruption() -> Iterator[None]:
+    """Let a process that is started here never be ended by Ctrl-C, not even before its first line has run."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # what multiprocessing starts first, and lets Ctrl-C through again thereafter
+    former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, former)
 
 
 def _portable(error: Exception, method: str) -> OperatorError:

@@ -5,15 +5,17 @@
                         DECODING → COMPLETED          any state → CANCELLED | FAILED
 
 While one sequence is photographed, a second thread checks, commits and demodulates the one before it. A sequence that
-fails its check is taken again, at most as often as the scan allows. On every way out the projector is dark.
+fails its check, or in which a device failed, is taken again, at most as often as the scan allows; the bench brings a
+device back that was lost. On every way out the projector is dark.
 """
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
@@ -194,7 +196,14 @@ class Acquisition:
     def _dark_afterwards(self) -> Iterator[None]:
         try:
             yield
-        finally:
+        except BaseException:
+            self._darken_if_possible()
+            raise
+        self.bench.darken()
+
+    def _darken_if_possible(self) -> None:
+        """Switch the light off on the way out of trouble, which a projector that fails as well must not hide."""
+        with suppress(HardwareError):
             self.bench.darken()
 
     @contextmanager
@@ -230,11 +239,18 @@ class Acquisition:
         width, height = self.bench.projector_size
         levels = (plan.mean + plan.amplitude, plan.mean - plan.amplitude)
         pictures = [np.full((height, width), round(255 * level), np.uint8) for level in levels]
-        self.bench.prepare(pictures)
         fmt = self.bench.frame_format
         bright, dark = (np.empty(fmt.shape, fmt.dtype) for _ in range(2))
-        self.bench.expose(0, bright)
-        self.bench.expose(1, dark)
+        for attempt in range(1, self.scan.attempts + 1):
+            try:
+                self.bench.prepare(pictures)
+                self.bench.expose(0, bright)
+                self.bench.expose(1, dark)
+                break
+            except HardwareError as error:
+                if not error.repeatable or attempt == self.scan.attempts:
+                    raise
+                self._note(f"exposure check: {error.message}; it was made again")
         self.bench.darken()
         check_exposure(bright, dark, fmt.saturated_dn, self.scan.max_saturated_share)
 
@@ -257,21 +273,33 @@ class Acquisition:
                     if queue:
                         sequence, attempt = queue.pop(0)
                         frames = buffers[turn % 2][: len(plan.sequences[sequence].fringes)]
-                        turn += 1
-                        self._expose_sequence(number, plan, sequence, attempt, frames, total)
-                        job = self._finish_sequence(number, plan, sequence, attempt, frames, collected)
-                        launched = (sequence, attempt, worker.submit(job))
+                        try:
+                            self._expose_sequence(number, plan, sequence, attempt, frames, total)
+                        except HardwareError as error:
+                            queue[:0] = self._broken(number, plan, sequence, attempt, error)
+                        else:
+                            turn += 1
+                            job = self._finish_sequence(number, plan, sequence, attempt, frames, collected)
+                            launched = (sequence, attempt, worker.submit(job))
                     if pending is not None:
                         again = self._settle(number, plan, *pending)
                         queue[:0] = again
                     pending = launched
             except BaseException:
                 # Before the worker is waited for: whatever went wrong, the light goes out at once.
-                self.bench.darken()
+                self._darken_if_possible()
                 raise
         self.bench.darken()
+        self._note_counters(number)
         self.frames[number] = plan.frame_count
         return collected
+
+    def _note_counters(self, number: int) -> None:
+        """Write what the devices have counted so far into the recording."""
+        devices = self.bench.describe()
+        counters = {n: d["counters"] for n, d in devices.items() if isinstance(d, Mapping) and "counters" in d}
+        if counters:
+            self.take.note(f"counters after round {number}: {json.dumps(counters)}")
 
     def _expose_sequence(
         self, number: int, plan: Plan, sequence: int, attempt: int, frames: Pixels, total: int
@@ -321,17 +349,30 @@ class Acquisition:
         reasons = job.result()
         if not reasons:
             return []
-        label = plan.sequences[sequence].label
         if attempt >= self.scan.attempts:
+            label = plan.sequences[sequence].label
             raise AcquisitionError(
                 f"round {number}, sequence {sequence + 1} ({label}) failed its check on {attempt} attempts: "
                 + "; ".join(reasons),
                 "Raise the bench's settle time (display latency), and check that nothing moves and no light flickers.",
             )
-        count = len(plan.sequences[sequence].fringes)
-        self.repeats += count
-        self._enter(ScanState.REPEATING, f"{label}, attempt {attempt + 1}")
-        self._note(f"round {number}, {label}: {reasons[0]}; the sequence was taken again")
+        return self._again(number, plan, sequence, attempt, reasons[0])
+
+    def _broken(
+        self, number: int, plan: Plan, sequence: int, attempt: int, error: HardwareError
+    ) -> list[tuple[int, int]]:
+        """Record that a device failed within a sequence; returns it again, with the next attempt, where that helps."""
+        self._darken_if_possible()
+        self.take.abort_sequence(number, sequence, attempt, error.message)
+        if not error.repeatable or attempt >= self.scan.attempts:
+            raise error
+        return self._again(number, plan, sequence, attempt, error.message)
+
+    def _again(self, number: int, plan: Plan, sequence: int, attempt: int, reason: str) -> list[tuple[int, int]]:
+        fringes = plan.sequences[sequence]
+        self.repeats += len(fringes.fringes)
+        self._enter(ScanState.REPEATING, f"{fringes.label}, attempt {attempt + 1}")
+        self._note(f"round {number}, {fringes.label}: {reason}; the sequence was taken again")
         self._enter(ScanState.CAPTURING, f"round {number} of {self.method.rounds}")
         return [(sequence, attempt + 1)]
 

@@ -347,9 +347,12 @@ class Rig:
             raise error.inside(str(path)) from None
 
     def save(self, path: str | Path) -> None:
-        """Write the rig as JSON."""
+        """Write the rig as JSON; a rig that was there is replaced whole or not at all."""
+        path = Path(path)
+        partial = path.with_name(f".{path.name}.partial")
         try:
-            Path(path).write_text(json.dumps(self.to_json(), indent=2) + "\n", encoding="utf-8")
+            partial.write_text(json.dumps(self.to_json(), indent=2) + "\n", encoding="utf-8")
+            partial.replace(path)
         except OSError as error:
             raise RigError(
                 f"cannot write rig {path}: {error.strerror}", "Choose a place that can be written."

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers import Bench
+from drivers import Bench, DisplayLatency, HardwareError, LatencyBound
 from scanner.acquisition import Acquisition, Listener
 from scanner.config import ConfigError, LoadedConfig, Problem, open_bench
 from scanner.decoding import Decoder
@@ -19,6 +21,9 @@ from scanner.take import TakeWriter
 
 if TYPE_CHECKING:
     from scanner.patterns import Plan
+
+DISPLAY_LATENCY = "display_latency"
+"""Name of the latency among the notes of a rig."""
 
 
 def run_scan(loaded: LoadedConfig, out: Path, overwrite: bool, listener: Listener) -> tuple[ScanResult, Path]:
@@ -50,6 +55,8 @@ def run_scan(loaded: LoadedConfig, out: Path, overwrite: bool, listener: Listene
         with open_bench(loaded) as bench:
             opened = time.perf_counter()
             rig = find_rig(loaded, bench)
+            if isinstance(bench, LatencyBound):
+                bench.use_latency(latency_of(rig))
             plan = method.first_round(config.scan, bench.projector_size)
             with _begin_take(folder.path / "take", loaded, bench, rig, plan, method.rounds) as take:
                 decoder = Decoder(method, config.scan, bench.noise, rig)
@@ -115,6 +122,40 @@ def find_rig(loaded: LoadedConfig, bench: Bench) -> Rig:
                 f"name the rig that was calibrated with this {what} at this resolution",
             )
     return rig
+
+
+def latency_of(rig: Rig) -> DisplayLatency | None:
+    """The display latency that was measured with this rig; None where none was."""
+    document = rig.metadata.get(DISPLAY_LATENCY)
+    return None if document is None else DisplayLatency.from_json(document)
+
+
+def measure_latency(loaded: LoadedConfig, progress: Callable[[int, int], None]) -> tuple[DisplayLatency, Path | None]:
+    """Measure the display latency of a bench and keep it with the configuration's rig.
+
+    Returns
+    -------
+    latency, path
+        The latency, and the rig file that now holds it; None where the configuration names no rig in our own format.
+
+    Raises
+    ------
+    HardwareError
+        The bench has no display whose latency could be measured, or the measurement failed.
+    """
+    with open_bench(loaded) as bench:
+        if not isinstance(bench, LatencyBound):
+            raise HardwareError(
+                f"bench {bench.name} knows by itself when a pattern is on the surface",
+                "Nothing is to be measured: scan.",
+            )
+        latency = bench.measure_latency(progress)
+    path = loaded.rig_path
+    if path is None or path.suffix != ".json":
+        return latency, None
+    rig = Rig.load(path)
+    replace(rig, metadata={**rig.metadata, DISPLAY_LATENCY: latency.to_json()}).save(path)
+    return latency, path
 
 
 def _refused(loaded: LoadedConfig, what: str, remedy: str) -> ConfigError:

@@ -48,7 +48,8 @@ class SimulatedBenchKind:
             projector=projector,
             clock=clock,
             settle_s=settle_s,
-            timeout_s=max(2.0, 2 * (camera.exposure_s + settings.camera.readout_s)),
+            exposure_s=camera.exposure_s,
+            timeout_s=2.0 + settings.camera.readout_s,
             simulated=True,
             rig=settings.rig().to_json(),
         ) as bench:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers import DeviceLostError, OperatorError
+from drivers import DeviceLostError, DeviceSettingError, FrameLossError, FrameTimeoutError, OperatorError
 from scanner.acquisition import (
     TRANSITIONS,
     Acquisition,
@@ -147,11 +147,76 @@ def test_gives_up_after_the_allowed_attempts(array_bench, tmp_path):
     assert Take.open(tmp_path / "take").status == "failed"
 
 
+FAILURES = {
+    "timeout": FrameTimeoutError("camera: no frame", "look at the trigger"),
+    "loss": FrameLossError("camera: frame 17 is incomplete", "look at the cable"),
+    "lost": DeviceLostError("camera: gone", "plug it in"),
+}
+
+
+@pytest.mark.parametrize(
+    ("error", "at"), [("lost", 1), ("lost", 2), ("lost", 2 + 107), ("lost", 2 + 108 + 40), ("timeout", 17), ("loss", 17)]
+)
+def test_device_that_fails_once_costs_one_sequence(array_bench, tmp_path, at, error):
+    error = FAILURES[error]
+
+    def fail(number, index):
+        if number == at:
+            raise error
+
+    bench = array_bench(on_expose=fail)
+    job = acquisition(bench, tmp_path)
+    maps = run(job)
+    assert (np.abs(maps.x_p - bench.x)[bench.alpha == 0] < 0.25).mean() > 0.99
+    assert [note for note in job.listener.notes if error.message in note]
+    take = Take.open(tmp_path / "take")
+    assert take.status == "completed"
+    assert not take.missing(1)
+    assert not take.missing(2)
+    # In the exposure check nothing is recorded yet.
+    assert job.repeats == (0 if at < 2 else 6)
+    journal = (tmp_path / "take" / "journal.jsonl").read_text()
+    assert journal.count("sequence_aborted") == (0 if at < 2 else 1)
+
+
+def test_device_that_cannot_be_used_ends_the_scan_at_once(array_bench, tmp_path):
+    refusal = DeviceSettingError("camera: no such feature", "correct it")
+
+    def fail(number, index):
+        if number == 17:
+            raise refusal
+
+    job = acquisition(array_bench(on_expose=fail), tmp_path)
+    with pytest.raises(DeviceSettingError):
+        run(job)
+    assert job.bench.exposures == 18
+    assert job.bench.dark
+
+
+def test_trouble_with_darkening_does_not_hide_what_went_wrong(array_bench, tmp_path, monkeypatch):
+    def fail(number, index):
+        if number >= 17:
+            raise DeviceLostError("camera: gone", "plug it in")
+
+    bench = array_bench(on_expose=fail)
+    monkeypatch.setattr(type(bench), "darken", _darken_that_fails_later())
+    with pytest.raises(DeviceLostError, match="camera: gone"):
+        run(acquisition(bench, tmp_path))
+
+
+def _darken_that_fails_later():
+    def darken(self):
+        if self.exposures > 3:
+            raise DeviceLostError("projector: gone as well", "plug it in")
+
+    return darken
+
+
 @pytest.mark.parametrize("at", [0, 1, 2, 50, 2 + 108, 2 + 108 + 40, 2 + 215])
 @pytest.mark.parametrize("error", [DeviceLostError("camera: gone", "plug it in"), KeyboardInterrupt()])
 def test_whatever_ends_a_scan_the_projector_is_dark_and_the_take_opens(array_bench, tmp_path, at, error):
     def fail(number, index):
-        if number == at:
+        if number >= at:
             raise error
 
     bench = array_bench(on_expose=fail)

@@ -1,0 +1,271 @@
+"""What all benches of a camera and a projector share: open in order, bring back what was lost, close in reverse."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.devices import (
+    Camera,
+    Clock,
+    Device,
+    DeviceState,
+    FrameFormat,
+    FrameStamp,
+    NoiseModel,
+    Pixels,
+    Projector,
+    Trigger,
+)
+from drivers.errors import (
+    DeviceLostError,
+    DeviceNotFoundError,
+    DeviceSettingError,
+    HardwareError,
+    IllegalCallError,
+    OperatorError,
+    SequenceFaultError,
+)
+from drivers.latency import DisplayLatency, measure_latency
+
+_RETRY_S = 0.5
+
+
+@dataclass
+class DeviceBench:
+    """Camera and projector, perhaps with a trigger box; base of `SteppedBench` and `StreamedBench`.
+
+    Parameters
+    ----------
+    name, simulated, rig
+        See `drivers.Bench`.
+    camera, projector, clock, trigger
+        The devices; with no ``trigger`` box the camera is triggered by software or by the projector itself.
+    settle_s
+        From the hand-over of a pattern until it is surely on the surface, s. None: from the measured latency that
+        `use_latency` brings.
+    exposure_s
+        Of the camera, s.
+    timeout_s
+        From the end of an exposure until its frame must have come, s.
+    reconnect_s
+        How long a device that was lost is waited for, s.
+
+    Notes
+    -----
+    Entering opens and readies the devices in the order projector, camera, trigger box; leaving darkens the projector,
+    stops the triggers and closes in reverse, whatever happened.
+    """
+
+    name: str
+    camera: Camera
+    projector: Projector
+    clock: Clock
+    settle_s: float | None = None
+    exposure_s: float = 0.0
+    timeout_s: float = 2.0
+    simulated: bool = False
+    rig: Mapping[str, Any] | None = None
+    trigger: Trigger | None = None
+    reconnect_s: float = 0.0
+    latency: DisplayLatency | None = field(default=None, init=False)
+    _format: FrameFormat | None = field(default=None, init=False)
+    _patterns: int = field(default=0, init=False)
+    _disturbed: bool = field(default=False, init=False)
+    _stack: ExitStack = field(default_factory=ExitStack, init=False)
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            for device in self._devices:
+                stack.callback(device.close)
+                self._ready(device)
+                if device is self.projector:
+                    stack.callback(self._darken_if_open)
+            if self.trigger is not None:
+                stack.callback(self._stop_trigger)
+            # Last in, first out: whatever else happens on the way down, the projector goes dark first.
+            stack.callback(self._darken_if_open)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    @property
+    def _devices(self) -> list[Device]:
+        devices: list[Device] = [self.projector, self.camera]
+        return devices if self.trigger is None else [*devices, self.trigger]
+
+    @property
+    def projector_size(self) -> tuple[int, int]:
+        """(width, height) of a pattern, px."""
+        return self.projector.size
+
+    @property
+    def frame_format(self) -> FrameFormat:
+        """What frames look like; known once the bench is open."""
+        if self._format is None:
+            raise IllegalCallError(self.name, "CLOSED", "frame_format", "OPEN")
+        return self._format
+
+    @property
+    def noise(self) -> NoiseModel | None:
+        """The camera's noise model."""
+        return self.camera.noise
+
+    def use_latency(self, latency: DisplayLatency | None) -> None:
+        """Take over the measured latency; see `drivers.bench.LatencyBound`."""
+        self.latency = latency
+        if self.settle_s is None:
+            if latency is None:
+                raise DeviceSettingError(
+                    f"{self.name}: it is not known how late {self.projector.name} shows a picture",
+                    "Measure it once with: scan latency --config FILE; it is kept with the rig.",
+                )
+            self.settle_s = latency.settle_s(self.projector.period_s)
+
+    def measure_latency(self, progress: Callable[[int, int], None]) -> DisplayLatency:
+        """Measure the display's latency with this bench's camera; see `drivers.latency.measure_latency`."""
+        return measure_latency(
+            self.camera,
+            self.projector,
+            self.clock,
+            np.random.default_rng(),
+            trigger=self.trigger,
+            frame_format=self.frame_format,
+            exposure_s=self.exposure_s,
+            progress=progress,
+        )
+
+    def prepare(self, patterns: Sequence[NDArray[np.uint8]]) -> None:
+        """Bring back what was lost, forget what a broken sequence has left, and load the patterns."""
+        self._recover()
+        self.projector.load(patterns)
+        self._patterns = len(patterns)
+        self._prepared()
+
+    def _prepared(self) -> None:
+        """What else is to be done before the first pattern."""
+
+    def expose(self, index: int, out: Pixels) -> FrameStamp:
+        """Photograph pattern ``index`` into ``out``; see `drivers.Bench`."""
+        try:
+            return self._expose(index, out)
+        except BaseException:
+            self._disturbed = True
+            raise
+
+    def _expose(self, index: int, out: Pixels) -> FrameStamp:
+        raise NotImplementedError
+
+    def darken(self) -> None:
+        """Project black."""
+        self._darken_if_open()
+
+    def describe(self) -> Mapping[str, Any]:
+        """JSON-ready snapshot of all devices."""
+        devices: dict[str, Any] = {"camera": self.camera.describe(), "projector": self.projector.describe()}
+        if self.trigger is not None:
+            devices["trigger"] = self.trigger.describe()
+        return {
+            "name": self.name,
+            "simulated": self.simulated,
+            "synchronisation": type(self).__name__.removesuffix("Bench").lower(),
+            "settle_s": self.settle_s,
+            "display_latency": None if self.latency is None else self.latency.to_json(),
+            **devices,
+        }
+
+    def check_counts(self, sent: int) -> None:
+        """Refuse the sequence unless as many pulses were sent and exposures made as frames have come.
+
+        Parameters
+        ----------
+        sent
+            Pulses asked for since the box was armed; each has given one frame.
+
+        Raises
+        ------
+        SequenceFaultError
+            The box has counted something else.
+        """
+        if self.trigger is None:
+            return
+        counts = self.trigger.counts()
+        exposed = sent if counts.exposed is None else counts.exposed
+        if (counts.sent, exposed, counts.missed) != (sent, sent, 0):
+            back = "not counted" if counts.exposed is None else str(counts.exposed)
+            raise SequenceFaultError(
+                f"{self.trigger.name}: {counts.sent} pulses sent, {counts.missed} missed, exposures counted back: "
+                f"{back}; {sent} frames came for {sent} patterns",
+                "Check the cables between box and camera; exposure and read-out must be shorter than the time between "
+                "two pulses.",
+            )
+
+    def _recover(self) -> None:
+        deadline = self.clock.now() + self.reconnect_s
+        for device in self._devices:
+            while device.state in (DeviceState.FAULT, DeviceState.CLOSED) or self._disturbed:
+                try:
+                    self._ready(device)
+                    break
+                except HardwareError as error:
+                    away = isinstance(error, DeviceLostError | DeviceNotFoundError)
+                    if away and self.clock.now() < deadline:
+                        self.clock.sleep(_RETRY_S)
+                        continue
+                    # It has been waited for: to take the sequence again would only wait once more.
+                    error.repeatable = error.repeatable and not away
+                    raise
+        self._disturbed = False
+
+    def _ready(self, device: Device) -> None:
+        """Bring one device to where a sequence can begin, from whatever state it is in."""
+        if device.state is DeviceState.FAULT:
+            device.close()
+        fresh = device.state is DeviceState.CLOSED
+        if fresh:
+            device.open()
+        if device is self.projector:
+            if fresh:
+                self.projector.configure()
+        elif device is self.camera:
+            if fresh:
+                self._configure_camera()
+            else:
+                self.camera.stop()
+            self.camera.arm()
+            self.camera.start()
+        elif self.trigger is not None:
+            if fresh:
+                self.trigger.configure()
+            else:
+                self.trigger.stop()
+
+    def _configure_camera(self) -> None:
+        found = self.camera.configure()
+        if self._format is not None and found != self._format:
+            raise DeviceSettingError(
+                f"{self.camera.name}: frames are now {found.width} × {found.height} px of {found.bits} bits, "
+                f"they were {self._format.width} × {self._format.height} px of {self._format.bits} bits",
+                "Connect the camera that the scan was begun with.",
+            )
+        self._format = found
+
+    def _darken_if_open(self) -> None:
+        if self.projector.state is not DeviceState.CLOSED:
+            self.projector.darken()
+
+    def _stop_trigger(self) -> None:
+        if self.trigger is not None and self.trigger.state not in (DeviceState.CLOSED, DeviceState.FAULT):
+            # A box that does not answer has no more pulses to give; closing it comes next.
+            with suppress(OperatorError):
+                self.trigger.stop()

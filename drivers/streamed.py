@@ -1,0 +1,81 @@
+"""Hardware-triggered: the projector plays a sequence by itself, and its own signal exposes the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.device_bench import DeviceBench
+from drivers.devices import FrameStamp, Pixels, SequencePlayer
+from drivers.errors import FrameLossError, SequenceFaultError
+
+
+@dataclass
+class StreamedBench(DeviceBench):
+    """The fast way: one pattern per refresh, each exposure started by the light or the signal of its own pattern.
+
+    Either the projector's trigger output goes to the camera, or a light sensor on the projector's synchronisation
+    patch, or the projector's output, goes to the trigger box, which gives the camera one pulse per pattern and counts
+    its exposures back. Parameters as `drivers.device_bench.DeviceBench`; ``projector`` is a `SequencePlayer`.
+    """
+
+    _next: int = field(default=0, init=False)
+    _last_id: int | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.projector, SequencePlayer):
+            raise TypeError(f"{self.projector.name} cannot play a sequence")
+        self._player: SequencePlayer = self.projector
+
+    def prepare(self, patterns: Sequence[NDArray[np.uint8]]) -> None:
+        """Load the patterns; after a broken sequence the camera may count its frames anew."""
+        if self._disturbed:
+            self._last_id = None
+        super().prepare(patterns)
+        self._next = 0
+
+    def _expose(self, index: int, out: Pixels) -> FrameStamp:
+        if index not in (0, self._next):
+            raise SequenceFaultError(
+                f"{self.name}: pattern {index} was asked for, but {self._next} is the next that the projector plays",
+                "A streamed sequence is photographed in order; this is a fault of the calling program, please report.",
+            )
+        if index == 0:
+            self._begin()
+        stamp = self.camera.fetch(out, self._wait_s if index == 0 else self.exposure_s + self.timeout_s)
+        if self._last_id is not None and stamp.frame_id != self._last_id + 1:
+            raise FrameLossError(
+                f"{self.camera.name}: frame {stamp.frame_id} came where {self._last_id + 1} was due, at pattern "
+                f"{index + 1} of {self._patterns}",
+                "Something else triggers the camera, or frames were lost: check the trigger line and the camera's "
+                "bandwidth.",
+            )
+        self._last_id = stamp.frame_id
+        self._next = index + 1
+        if self._next == self._patterns:
+            self._check_played()
+        return stamp
+
+    @property
+    def _wait_s(self) -> float:
+        """From play to the first frame, s."""
+        return self.exposure_s + self.timeout_s + (1.0 if self.latency is None else self.latency.p99_s)
+
+    def _begin(self) -> None:
+        if self.trigger is not None:
+            self.trigger.arm(self._patterns)
+        self._player.play()
+
+    def _check_played(self) -> None:
+        record = self._player.finish(self.timeout_s)
+        if record.late:
+            numbers = ", ".join(str(n + 1) for n in record.late[:8])
+            raise SequenceFaultError(
+                f"{self.projector.name}: {len(record.late)} of {self._patterns} patterns came a refresh or more too "
+                f"late ({numbers}{', …' if len(record.late) > 8 else ''})",
+                "Close other programs, switch off the compositor, or scan step by step.",
+            )
+        self.check_counts(self._patterns)
