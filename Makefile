@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 BENCH  := $(VENV)/.bench-ready
 
-.PHONY: demo test lint bench clean help
+.PHONY: demo virtual-bench test lint bench soak clean help
 
 help:            ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 16
@@ -21,6 +21,10 @@ $(READY): pyproject.toml
 demo: $(READY)   ## scan the mirror scene on the simulated bench and compare MFS with TPS
 	$(BIN)/scan --config configs/demo.yaml --out demo-result --overwrite
 	$(BIN)/scan compare --config configs/demo.yaml --methods mfs,tps --reuse demo-result --out demo-comparison --overwrite
+
+# The real drivers need a virtual X server and a C compiler here; where one is missing, the error names what to install.
+virtual-bench: $(READY)  ## the same scan through the real drivers: window, GenICam camera and trigger box, emulated below
+	$(BIN)/scan --config configs/virtual_bench.yaml --out virtual-bench-result --overwrite
 
 test: lint       ## lint, types, arrows and every test
 	$(BIN)/python -m pytest
@@ -40,5 +44,8 @@ $(BENCH): $(READY)
 bench: $(BENCH)  ## speed, as ratios to a peer and to reading the frames once
 	$(BIN)/python -m pytest tests/benchmarks -m bench -s
 
+soak: $(READY)   ## two thousand scans' worth of sequences with random faults
+	MFS_SCANNER_SOAK=2000 $(BIN)/python -m pytest tests/test_soak.py -s
+
 clean:           ## forget the environment and the demo's output
-	rm -rf $(VENV) demo-result demo-comparison
+	rm -rf $(VENV) demo-result demo-comparison virtual-bench-result
