@@ -61,6 +61,7 @@ class DeviceProcess:
         self._process: Any = None
         self._commands: Connection | None = None
         self._events: Connection | None = None
+        self._calls = 0
 
     @property
     def alive(self) -> bool:
@@ -83,6 +84,7 @@ class DeviceProcess:
             The process died or said nothing within ``timeout_s``.
         """
         context = multiprocessing.get_context("spawn")
+        self._calls = 0
         self._commands, commands = context.Pipe()
         self._events, events = context.Pipe(duplex=False)
         self._process = context.Process(
@@ -109,7 +111,8 @@ class DeviceProcess:
         DeviceLostError
             The process has died, or did not answer within ``timeout_s``; then it is killed.
         """
-        self._send(method, args, answered=True)
+        self._calls += 1
+        self._send(method, args, self._calls)
         return self._answer(method, timeout_s)
 
     def post(self, method: str, *args: Any) -> None:
@@ -120,7 +123,7 @@ class DeviceProcess:
         DeviceLostError
             The process has died.
         """
-        self._send(method, args, answered=False)
+        self._send(method, args, None)
 
     def next_event(self, timeout_s: float) -> Any:
         """Wait for the server's next message; None where there was none within ``timeout_s``.
@@ -152,22 +155,25 @@ class DeviceProcess:
             process.join()
         process.close()
 
-    def _send(self, method: str, args: tuple[Any, ...], *, answered: bool) -> None:
+    def _send(self, method: str, args: tuple[Any, ...], number: int | None) -> None:
         if self._commands is None:
             raise self._lost(f"{method}() was called on a process that is not running")
         try:
-            self._commands.send((method, args, answered))
+            self._commands.send((number, method, args))
         except OSError:
             raise self._died() from None
 
     def _answer(self, method: str, timeout_s: float) -> Any:
         assert self._commands is not None
+        deadline = time.monotonic() + timeout_s
+        number: int | None = None
         try:
-            if not self._commands.poll(timeout_s):
-                # What hangs cannot be talked to again: an answer that comes later would be taken for another.
-                self._process.kill()
-                raise self._lost(f"no answer to {method}() within {timeout_s:g} s")
-            error, value = self._commands.recv()
+            # The answer to a call that was interrupted, by Ctrl-C for one, may still be on its way.
+            while number != self._calls:
+                if not self._commands.poll(max(deadline - time.monotonic(), 0.0)):
+                    self._process.kill()
+                    raise self._lost(f"no answer to {method}() within {timeout_s:g} s")
+                number, error, value = self._commands.recv()
         except (EOFError, OSError):
             raise self._died() from None
         if error is not None:
@@ -199,10 +205,10 @@ def _serve(commands: Connection, events: Connection, factory: Callable[..., Serv
     try:
         server = factory(events.send, *args)
     except Exception as error:
-        commands.send((_portable(error, "start"), None))
+        commands.send((0, _portable(error, "start"), None))
         return
     try:
-        commands.send((None, None))
+        commands.send((0, None, None))
         _loop(commands, events.send, server)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the scan has let go
@@ -216,15 +222,17 @@ def _loop(commands: Connection, emit: Emit, server: Server) -> None:
         patience = server.idle()
         if not wait([commands], patience):
             continue
-        method, args, answered = commands.recv()
+        number, method, args = commands.recv()
+        failure: OperatorError | None = None
+        value: Any = None
         try:
-            answer: tuple[OperatorError | None, Any] = None, getattr(server, method)(*args)
+            value = getattr(server, method)(*args)
         except Exception as error:
-            answer = _portable(error, method), None
-        if answered:
-            commands.send(answer)
-        elif answer[0] is not None:
-            emit(answer[0])
+            failure = _portable(error, method)
+        if number is not None:
+            commands.send((number, failure, value))
+        elif failure is not None:
+            emit(failure)
 
 
 @contextlib.contextmanager

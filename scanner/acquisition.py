@@ -26,7 +26,7 @@ import numpy as np
 from drivers import Bench, HardwareError, OperatorError, Pixels
 from scanner.config import ScanSection
 from scanner.decoding import Decoder
-from scanner.integrity import check_sequence
+from scanner.integrity import SequenceHistory, check_sequence
 from scanner.methods import Method, RoundFrames
 from scanner.patterns import Plan
 from scanner.result import Maps
@@ -156,6 +156,7 @@ class Acquisition:
     repeats: int = field(default=0, init=False)
     notes: list[str] = field(default_factory=list, init=False)
     _done: int = field(default=0, init=False)
+    _history: SequenceHistory = field(default_factory=SequenceHistory, init=False)
 
     def run(self) -> Maps:
         """Both rounds; returns the fused maps.
@@ -173,12 +174,19 @@ class Acquisition:
             with self._dark_afterwards():
                 first_plan = self.method.first_round(self.scan, self.bench.projector_size)
                 self._enter(ScanState.PREFLIGHT, "exposure check")
-                self._preflight(first_plan)
+                levels = self._preflight(first_plan)
+                self._history.begin_round(
+                    first_plan.size, levels=levels, saturated_dn=self.bench.frame_format.saturated_dn
+                )
                 first = self._capture(1, first_plan, first_plan.frame_count)
                 self._enter(ScanState.DECODING, "decoding round 1")
                 with self._timed("decode round 1"):
                     second_plan = self.decoder.first(first)
                 if second_plan is not None:
+                    found = self.decoder.maps
+                    self._history.begin_round(
+                        second_plan.size, coordinates=(found.x_p, found.y_p), lit=second_plan.mask
+                    )
                     second = self._capture(2, second_plan, first_plan.frame_count + second_plan.frame_count)
                     self._enter(ScanState.DECODING, "decoding round 2")
                     with self._timed("decode round 2"):
@@ -234,8 +242,8 @@ class Acquisition:
         self.notes.append(text)
         self.listener.note(text)
 
-    def _preflight(self, plan: Plan) -> None:
-        """Look at the brightest and the darkest picture before anything is measured."""
+    def _preflight(self, plan: Plan) -> tuple[Pixels, Pixels]:
+        """Look at the brightest and the darkest picture before anything is measured; returns their frames."""
         width, height = self.bench.projector_size
         levels = (plan.mean + plan.amplitude, plan.mean - plan.amplitude)
         pictures = [np.full((height, width), round(255 * level), np.uint8) for level in levels]
@@ -253,6 +261,7 @@ class Acquisition:
                 self._note(f"exposure check: {error.message}; it was made again")
         self.bench.darken()
         check_exposure(bright, dark, fmt.saturated_dn, self.scan.max_saturated_share)
+        return bright, dark
 
     def _capture(self, number: int, plan: Plan, total: int) -> RoundFrames:
         """Photograph all sequences of a round; returns what the method collected of them."""
@@ -331,7 +340,9 @@ class Acquisition:
         """Check, record and demodulate; returns what is wrong with the sequence."""
 
         def job() -> list[str]:
-            found = check_sequence(frames, plan.sequences[sequence], self.bench.frame_format.saturated_dn)
+            found = check_sequence(
+                frames, plan.sequences[sequence], self.bench.frame_format.saturated_dn, self._history
+            )
             if not found.good:
                 reasons = [f.message for f in found.findings]
                 self.take.abort_sequence(number, sequence, attempt, "; ".join(reasons))

@@ -1,4 +1,4 @@
-"""The command line: `scan`, `scan process`, `scan compare`, `scan schema`.
+"""The command line: `scan`, and `process`, `compare`, `doctor`, `preview`, `latency` and `schema` below it.
 
 Exit codes: 0 done; 2 bad configuration or usage; 3 hardware; 4 the scan ran but its result fails its own quality gates;
 130 interrupted. Everything heavy is imported where it is used, so that `scan --help` answers at once.
@@ -29,6 +29,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+NOT_READY = 3
 GATES_FAILED = 4
 INTERRUPTED = 130
 
@@ -184,6 +185,89 @@ def compare(
         comparison.picture(maps, rows, folder.path / "comparison.png", simulated)
         folder.write_json("comparison.json", {"simulated": simulated, "rows": comparison.to_json(rows)})
     terminal.comparison(rows, folder.out)
+
+
+@app.command()
+@interruptible
+def doctor(
+    config: Annotated[
+        Path | None, typer.Option("--config", "-c", help="Bench file (YAML): say whether a scan with it could start.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Where the recording would go.")] = Path(),
+    as_json: Annotated[bool, typer.Option("--json", help="Print a document for programs.")] = False,
+    sets: SetOption = None,
+) -> None:
+    """Look at machine and devices, say what is missing and what to do; nothing is projected."""
+    import json
+
+    from rich.console import Console
+
+    from scanner.config import load_config
+    from scanner.doctor.page import show, to_json, worst
+    from scanner.doctor.session import run_doctor
+
+    loaded = None if config is None else load_config(config, _overrides(sets, None))
+    console = Console(highlight=False)
+    name = None if config is None else str(config)
+    if as_json:
+        findings = run_doctor(loaded, out)
+        typer.echo(json.dumps(to_json(findings, name), indent=2, ensure_ascii=False))
+    else:
+        with console.status("…") as status:
+            findings = run_doctor(loaded, out, status.update)
+        show(console, findings, name)
+    if worst(findings) == "fault":
+        raise typer.Exit(NOT_READY)
+
+
+@app.command()
+@interruptible
+def preview(
+    config: ConfigOption,
+    pattern: Annotated[
+        str, typer.Option("--pattern", "-p", help="What is projected meanwhile: white, grey, black or fringes.")
+    ] = "white",
+    saturation: Annotated[
+        bool, typer.Option("--saturation/--plain", help="Mark saturated pixels red and too dark ones blue.")
+    ] = True,
+    once: Annotated[bool, typer.Option("--once", help="Print one reading and end.")] = False,
+    save: Annotated[Path | None, typer.Option("--save", help="With --once: write the picture to this PNG.")] = None,
+    sets: SetOption = None,
+) -> None:
+    """Show what the camera sees, with saturation and focus, on a screen that is not the projector's."""
+    from rich.console import Console
+
+    from scanner.config import load_config
+    from scanner.preview.session import run_preview
+
+    loaded = load_config(config, _overrides(sets, None))
+    console = Console(highlight=False, soft_wrap=True)
+    run_preview(loaded, pattern, console, coloured=saturation, once=once, path=save)
+
+
+@app.command()
+@interruptible
+def latency(config: ConfigOption, quiet: QuietOption = False, sets: SetOption = None) -> None:
+    """Measure how late the projector shows a picture, and keep it with the rig; black and white flash for a minute."""
+    from scanner.config import load_config
+    from scanner.session import measure_latency
+    from scanner.terminal import Terminal
+
+    terminal = Terminal(quiet)
+    with terminal.working() as report:
+        found, rig = measure_latency(
+            load_config(config, _overrides(sets, None)), lambda done, total: report(f"step {done} of {total}")
+        )
+    terminal.say(
+        [
+            f"from hand-over to surface: {found.median_s * 1e3:.1f} ms (median), {found.p99_s * 1e3:.1f} ms (p99 of "
+            f"{found.samples} steps)",
+            f"kept with the rig {rig}"
+            if rig is not None
+            else f"the file names no rig to keep it with; until it does, write bench.settle_s: {found.p99_s:.3f} plus "
+            "one refresh",
+        ]
+    )
 
 
 @app.command()

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from drivers import BenchKind, SteppedBench
 from sim_backend.clock import VirtualClock
-from sim_backend.settings import SimulatedSettings
+from sim_backend.settings import SceneSettings, SimulatedSettings
 
 if TYPE_CHECKING:
     from sim_backend.truth import Truth
@@ -56,7 +56,7 @@ class SimulatedBenchKind:
             yield bench
 
 
-def truth_of(settings: SimulatedSettings) -> Truth:
+def truth_of(settings: SceneSettings) -> Truth:
     """What is really there, for tests that judge a scan."""
     from sim_backend.cache import transport_of
     from sim_backend.optics import Optics

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import platformdirs
 
-from sim_backend.settings import SimulatedSettings
+from sim_backend.settings import SceneSettings
 from sim_backend.transport import Transport, trace
 
 _log = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ _SOURCES = (
 """The modules that decide what tracing gives; their text is part of the content: no old result outlives them."""
 
 
-def transport_of(settings: SimulatedSettings) -> Transport:
+def transport_of(settings: SceneSettings) -> Transport:
     """The light transport of a bench, from the cache or traced anew and cached.
 
     A cache that cannot be read or written costs time, never the scan.
@@ -58,14 +58,14 @@ def transport_of(settings: SimulatedSettings) -> Transport:
     return transport
 
 
-def _folder(settings: SimulatedSettings) -> Path:
+def _folder(settings: SceneSettings) -> Path:
     if settings.cache_dir is not None:
         return settings.cache_dir
     named = os.environ.get("MFS_SCANNER_CACHE")
     return Path(named) if named else Path(platformdirs.user_cache_dir("mfs-scanner", appauthor=False))
 
 
-def _content_hash(settings: SimulatedSettings) -> str:
+def _content_hash(settings: SceneSettings) -> str:
     here = Path(__file__).parent
     content = {
         "sources": [hashlib.sha256((here / f"{name}.py").read_bytes()).hexdigest() for name in _SOURCES],

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers import (
     DeviceLostError,
@@ -24,8 +23,8 @@ from drivers import (
 from sim_backend.clock import VirtualClock
 from sim_backend.optics import Optics, Sensor
 from sim_backend.settings import CameraSettings, FaultSettings, ProjectorSettings
+from sim_backend.surface import Picture, Surface
 
-Picture = NDArray[np.uint8]
 _ROUNDING_S = 1e-9
 
 
@@ -47,8 +46,7 @@ class SimulatedProjector:
         self._life = Lifecycle(self.name)
         self._pictures: list[Picture] = []
         self._black = np.zeros((settings.height_px, settings.width_px), np.uint8)
-        # When which picture came on the surface; the last one that is on stays.
-        self._timeline: deque[tuple[float, Picture]] = deque([(-math.inf, self._black)])
+        self._surface = Surface(self._black)
 
     @property
     def state(self) -> DeviceState:
@@ -108,7 +106,7 @@ class SimulatedProjector:
 
     def close(self) -> None:
         """Switch off; the surface is dark at once."""
-        self._appear(self._clock.now(), self._black)
+        self._surface.appear(self._clock.now(), self._black)
         self._pictures = []
         self._life.move("close")
 
@@ -124,14 +122,8 @@ class SimulatedProjector:
     def _hand_over(self, picture: Picture) -> float:
         now = self._clock.now()
         refresh = math.ceil((now + self._settings.latency_s) / self.period_s - _ROUNDING_S) * self.period_s
-        self._appear(refresh, picture)
+        self._surface.appear(refresh, picture)
         return now
-
-    def _appear(self, moment: float, picture: Picture) -> None:
-        # Whatever has not come on by then is replaced.
-        while self._timeline[-1][0] >= moment:
-            self._timeline.pop()
-        self._timeline.append((moment, picture))
 
     def on_surface(self, begin: float, end: float, *, stale: bool = False) -> list[tuple[float, Picture]]:
         """Shares of the time from ``begin`` to ``end`` (s) and the pictures that were on; earlier ones are forgotten.
@@ -143,14 +135,8 @@ class SimulatedProjector:
         stale
             Pretend that the latest change has not come about.
         """
-        while len(self._timeline) > 2 and self._timeline[2][0] <= begin:
-            self._timeline.popleft()
-        changes = list(self._timeline)
-        if stale and len(changes) > 1:
-            del changes[-1]
-        ends = [on for on, _ in changes[1:]] + [math.inf]
-        overlaps = [(min(off, end) - max(on, begin), picture) for (on, picture), off in zip(changes, ends, strict=True)]
-        return [(overlap / (end - begin), picture) for overlap, picture in overlaps if overlap > 0]
+        self._surface.forget(begin)
+        return self._surface.during(begin, end, stale=stale)
 
 
 class SimulatedCamera:

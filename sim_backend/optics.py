@@ -14,7 +14,7 @@ from scipy.special import ive
 
 from drivers import FrameFormat, NoiseModel, Pixels
 from sim_backend.kernels import Floats
-from sim_backend.settings import CameraSettings, ProjectorSettings, SimulatedSettings
+from sim_backend.settings import CameraSettings, ProjectorSettings, SceneSettings
 from sim_backend.transport import Transport
 from sim_backend.viewpoint import Viewpoint
 
@@ -45,7 +45,7 @@ class Optics:
     dn_per_radiance: float
 
     @classmethod
-    def of(cls, settings: SimulatedSettings, transport: Transport) -> Optics:
+    def of(cls, settings: SceneSettings, transport: Transport) -> Optics:
         """The chain with the sensitivity that ``camera.white_dn`` asks for."""
         projector = Viewpoint.projector(settings.rig())
         target = np.array([[0.0, 0.0, settings.convergence_mm]])

@@ -107,8 +107,8 @@ class FaultSettings(_Section):
     lose_camera_at: _Count | None = Field(None, description="The camera is unplugged at this exposure.")
 
 
-class SimulatedSettings(_Section):
-    """A bench that is not there: a scene, a camera and a projector that look at it, and how they fail."""
+class SceneSettings(_Section):
+    """A scene that is not there, a camera and a projector that look at it, and how its light is traced."""
 
     scene: Scene = Field(MirrorScene(), description="What stands in front of the bench.")
     camera: CameraSettings = Field(CameraSettings(), description="The camera.")
@@ -123,15 +123,7 @@ class SimulatedSettings(_Section):
         description="Where the projector's axis crosses the camera's: distance from the camera, mm.",
     )
     seed: int = Field(0, ge=0, description="Seed of the camera noise: the same seed gives the same frames.")
-    settle_s: float | None = Field(
-        None,
-        ge=0,
-        le=60,
-        description="From showing a picture to the trigger, s; left out, the latency and one refresh, which suffice.",
-    )
     transport: TransportSettings = Field(TransportSettings(), description="How finely light is traced.")
-    faults: FaultSettings = Field(FaultSettings(), description="Faults to provoke.")
-    real_time: bool = Field(False, description="Let simulated time really pass.")
     cache_dir: Path | None = Field(
         None,
         description="Where computed light transport is kept; left out, the environment's MFS_SCANNER_CACHE or the"
@@ -153,3 +145,16 @@ class SimulatedSettings(_Section):
         return Rig(
             self.camera.lens(), self.projector.lens(), rotation, -rotation @ centre, {"source": "simulated bench"}
         )
+
+
+class SimulatedSettings(SceneSettings):
+    """A bench that is not there: a scene, a camera and a projector that look at it, and how they fail."""
+
+    settle_s: float | None = Field(
+        None,
+        ge=0,
+        le=60,
+        description="From showing a picture to the trigger, s; left out, the latency and one refresh, which suffice.",
+    )
+    faults: FaultSettings = Field(FaultSettings(), description="Faults to provoke.")
+    real_time: bool = Field(False, description="Let simulated time really pass.")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,20 @@ import pytest
 from scipy.ndimage import map_coordinates, spline_filter
 
 from drivers import FrameFormat, FrameStamp, NoiseModel
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--hardware",
+        metavar="FILE",
+        help="bench file of real devices: the conformance suites run on them as well (they light up and flash)",
+    )
+
+
+def pytest_configure(config):
+    # The suites look for their subjects while tests are collected.
+    if config.getoption("--hardware"):
+        os.environ["MFS_SCANNER_HARDWARE"] = str(Path(config.getoption("--hardware")).resolve())
 
 
 class CountingClock:

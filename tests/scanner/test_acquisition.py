@@ -155,7 +155,8 @@ FAILURES = {
 
 
 @pytest.mark.parametrize(
-    ("error", "at"), [("lost", 1), ("lost", 2), ("lost", 2 + 107), ("lost", 2 + 108 + 40), ("timeout", 17), ("loss", 17)]
+    ("error", "at"),
+    [("lost", 1), ("lost", 2), ("lost", 2 + 107), ("lost", 2 + 108 + 40), ("timeout", 17), ("loss", 17)],
 )
 def test_device_that_fails_once_costs_one_sequence(array_bench, tmp_path, at, error):
     error = FAILURES[error]

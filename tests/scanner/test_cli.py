@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -343,3 +344,16 @@ def test_help_imports_nothing_heavy():
     code = "import sys; import scanner.cli; print([m for m in ('numba', 'open3d', 'cv2', 'scipy') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_latency_is_measured_and_told(tmp_path, run):
+    (tmp_path / "bench.yaml").write_text(
+        "bench: {kind: simulated, scene: {name: plane}, camera: {width_px: 96, height_px: 72, exposure_us: 4000},\n"
+        "  projector: {width_px: 160, height_px: 100, latency_s: 0.035}, transport: {photons: 1000, supersample: 1}}\n"
+    )
+    done = run("latency", "--config", "bench.yaml", "--quiet")
+    assert done.returncode == 0, done.stderr
+    # At 60 Hz a picture appears at the first refresh after 35 ms; the camera resolves its read-out of 5 ms.
+    median = float(re.search(r"surface: ([\d.]+) ms", done.stdout)[1])
+    assert 35 <= median <= 35 + 16.7 + 5.5
+    assert "bench.settle_s: 0.0" in done.stdout

@@ -1,0 +1,294 @@
+"""What the good sequences of a scan have shown, as far as it tells whether the next one is right.
+
+A sequence may be flawless in itself and yet not be the one that was asked for: all its pictures may belong to another,
+or come one step late and so begin anywhere. And three phase steps fit any three frames. Four things are the same in all
+sequences of a round, whatever their axis and frequency: the last picture of one is not the first of the next; the mean
+A of the steps, since their mean pattern is a uniform grey; the pixels that are lit; and the coordinate of a pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers import Pixels
+from scanner.integrity.sampling import gradients, grid
+from scanner.integrity.waveform import FEWEST, Reference, Waveform
+from scanner.patterns import Axis, FringeSequence
+
+_LOST = 0.2
+_STRONG = 4.0
+_SAME_PICTURE = 1.5
+_DIVERSE = 0.5
+_SAME_PHASES = 1.5
+_CONVINCED = 50.0
+_AGREED, _DISAGREED = 0.6, 0.2
+_ASKED = 256
+_UNWRAP_FROM = 3
+
+
+@dataclass
+class _Shown:
+    axis: Axis
+    frequency: float
+    z: NDArray[np.complex64]
+    sigma_z: float
+    usable: NDArray[np.bool_]
+    round: int
+
+
+@dataclass
+class SequenceHistory:
+    """The memory of one scan: make one for it, `begin_round` with each round, and give it to every `check_sequence`.
+
+    It is not safe to share among threads, and sequences must be checked in the order in which they were exposed.
+    """
+
+    _round: int = 0
+    _shown: list[_Shown] = field(default_factory=list)
+    _last: NDArray[np.float32] | None = None
+    _mean: NDArray[np.float32] | None = None
+    _means: int = 0
+    _lit: NDArray[np.bool_] | None = None
+    _extent: dict[Axis, int] = field(default_factory=dict)
+    _known: dict[Axis, NDArray[np.float32]] = field(default_factory=dict)
+    _levels: NDArray[np.float32] | None = None
+    _unclipped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    _frames: int = 0
+
+    def begin_round(
+        self,
+        size: tuple[int, int],
+        *,
+        levels: tuple[Pixels, Pixels] | None = None,
+        saturated_dn: int = 1 << 16,
+        coordinates: tuple[NDArray[np.float32] | None, NDArray[np.float32] | None] = (None, None),
+        lit: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Forget what does not hold any more; from here on the pictures are those of another plan.
+
+        Parameters
+        ----------
+        size
+            Projector (width, height), px.
+        levels
+            (H, W) frames under the brightest and the darkest uniform picture, where they were taken and all of the
+            projector is lit: the mean of every sequence lies between them by the same share.
+        saturated_dn
+            Grey value from which a pixel of ``levels`` says nothing.
+        coordinates
+            (H, W) projector coordinates x and y that an earlier round has found, NaN where unknown.
+        lit
+            (height, width) projector pixels that the round lights; None for all.
+        """
+        self._round += 1
+        self._extent = {"x": size[0], "y": size[1]}
+        self._mean, self._means, self._lit, self._levels = None, 0, None, None
+        self._known = {}
+        if levels is not None:
+            cells = grid(levels[0].shape)
+            self._levels = cells.take_all(np.stack(levels))
+            self._unclipped = self._levels[0] < saturated_dn
+        for axis, u in zip(("x", "y"), coordinates, strict=True):
+            if u is not None:
+                self._known[axis] = grid(u.shape).take(u)  # type: ignore[index]
+        if lit is not None and len(self._known) == 2:
+            x, y = self._known["x"], self._known["y"]
+            there = np.isfinite(x) & np.isfinite(y)
+            column = np.clip(np.rint(np.where(there, x, 0)), 0, size[0] - 1).astype(np.intp)
+            row = np.clip(np.rint(np.where(there, y, 0)), 0, size[1] - 1).astype(np.intp)
+            self._lit = there & lit[row, column]
+
+    def extent(self, axis: Axis) -> int | None:
+        """Projector pixels along ``axis``, where a round was begun."""
+        return self._extent.get(axis)
+
+    def exposed(self, last: NDArray[np.float32]) -> None:
+        """The last frame of a sequence, good or bad, at the sampled pixels."""
+        self._last = last
+
+    def accept(self, fringes: FringeSequence, waveform: Waveform, valid: NDArray[np.bool_]) -> None:
+        """Take over a sequence that was found good."""
+        mean = np.where(valid, waveform.mean, np.float32(np.nan))
+        if self._mean is None:
+            self._mean, self._means, self._frames = mean, 1, len(fringes.fringes)
+        else:
+            # The last few weigh most: light drifts.
+            self._means = min(self._means + 1, 8)
+            self._mean = self._mean + (mean - self._mean) / np.float32(self._means)
+        strong = waveform.usable & (np.abs(waveform.z) > _STRONG * waveform.clear_dn)
+        self._lit = strong if self._lit is None else self._lit & strong
+        if fringes.frequency is not None:
+            sigma_z = waveform.sigma_dn * float(np.sqrt(2 / len(fringes.fringes)))
+            shown = _Shown(fringes.axis, fringes.frequency, waveform.z, sigma_z, waveform.usable, self._round)
+            self._shown = [
+                s for s in self._shown if (s.axis, s.frequency, s.round) != (shown.axis, shown.frequency, shown.round)
+            ]
+            self._shown.append(shown)
+
+    # What the sequences before say of a new one; each returns what is wrong, in words, or "".
+
+    def begins_with_the_former(self, first: NDArray[np.float32], waveform: Waveform) -> bool:
+        """Whether the first frame is the last picture of the sequence before it, as far as their noise tells."""
+        lit = waveform.usable & (np.abs(waveform.z) > 4 * waveform.sigma_dn)
+        if self._last is None or np.count_nonzero(lit) < FEWEST:
+            return False
+        if not _diverse(waveform.z[lit]):
+            # All in the dark of one fringe, say: there, two pictures may look alike.
+            return False
+        off = float(np.sqrt(np.square(first[lit] - self._last[lit]).mean()))
+        return bool(off < _SAME_PICTURE * np.sqrt(2) * waveform.sigma_dn)
+
+    def reference(self, values: NDArray[np.float32], valid: NDArray[np.bool_]) -> Reference | None:
+        """The mean A of the steps whose (N, P) ``values`` are given, as the pictures before them have it."""
+        if self._mean is not None:
+            known = np.isfinite(self._mean)
+            return Reference(np.where(known, self._mean, np.float32(0)), known, 1 / (self._frames * self._means))
+        if self._levels is None:
+            return None
+        bright, dark = self._levels
+        contrast = bright - dark
+        strong = valid & _lit_by(contrast)
+        if np.count_nonzero(strong) < FEWEST:
+            return None
+        share = np.median((values.mean(axis=0)[strong] - dark[strong]) / contrast[strong])
+        return Reference(dark + share * contrast, valid & self._unclipped, float(share**2 + (1 - share) ** 2))
+
+    def lost_light(self, waveform: Waveform) -> str:
+        """Compare the pixels with fringes with those that had them before."""
+        expected = self._lit
+        if expected is None and self._levels is not None:
+            contrast = self._levels[0] - self._levels[1]
+            expected = contrast > 2 * _STRONG * waveform.clear_dn
+        if expected is None or np.count_nonzero(expected) < FEWEST:
+            return ""
+        share = float(waveform.usable[expected].mean())
+        if share >= _LOST:
+            return ""
+        return (
+            f"only {100 * share:.0f} % of the pixels that must show fringes do: the picture stood still, was dark, or "
+            "belongs to another sequence"
+        )
+
+    def shown_before(self, fringes: FringeSequence, waveform: Waveform) -> str:
+        """Whether all pictures are those of an earlier sequence, maybe turned round."""
+        frequency = fringes.frequency
+        assert frequency is not None
+        for former in self._shown:
+            if (former.axis, former.frequency) == (fringes.axis, frequency):
+                continue
+            both = waveform.usable & former.usable
+            if np.count_nonzero(both) < FEWEST:
+                continue
+            z, earlier = waveform.z[both], former.z[both]
+            b, before = np.abs(z), np.abs(earlier)
+            sigma_z = waveform.sigma_dn * np.sqrt(2 / len(fringes.fringes))
+            if not _diverse(earlier):
+                continue
+            turn = z * earlier.conj() / (b * before)
+            off = np.angle(turn * np.conj(turn.sum()))
+            expected = np.sqrt(np.square(sigma_z / b) + np.square(former.sigma_z / before) + 0.01**2)
+            if np.median(np.abs(off) / expected) > _SAME_PHASES * 0.6745:
+                continue
+            if former.axis == fringes.axis and not self._steeper(
+                former, fringes.axis, frequency, waveform, both, sigma_z
+            ):
+                continue
+            return (
+                f"the pictures are those of the sequence {former.axis} 1/{1 / former.frequency:.5g} px: the projector "
+                "has not taken over the new ones"
+            )
+        return ""
+
+    @staticmethod
+    def _steeper(
+        former: _Shown, axis: Axis, frequency: float, waveform: Waveform, both: NDArray[np.bool_], sigma_z: float
+    ) -> bool:
+        """Whether the phases rise from pixel to pixel as the former sequence's do, and not as this one's should."""
+        whole = np.repeat(both.reshape(-1, 9).all(axis=1), 9)
+        now, before = gradients(waveform.z)[:, whole], gradients(former.z)[:, whole]
+        moved = (now != 0) & (before != 0)
+        slope, old = np.angle(now[moved]), np.angle(before[moved])
+        level = np.abs(before[moved])
+        variance = (sigma_z**2 + former.sigma_z**2) / np.maximum(level, 1e-6) * 2
+        planned = np.angle(np.exp(1j * (slope - old * frequency / former.frequency)))
+        same = np.angle(np.exp(1j * (slope - old)))
+
+        def misfit(off: NDArray[np.float32]) -> float:
+            return float(np.minimum(off**2 / variance, 9).sum())
+
+        return misfit(planned) - misfit(same) > _CONVINCED
+
+    def elsewhere(self, fringes: FringeSequence, waveform: Waveform) -> str:
+        """Whether the phases contradict the coordinates that the sequences before, or an earlier round, have found."""
+        frequency = fringes.frequency
+        assert frequency is not None
+        sigma_z = waveform.sigma_dn * float(np.sqrt(2 / len(fringes.fringes)))
+        if fringes.axis in self._known:
+            u = self._known[fringes.axis]
+            there = waveform.usable & np.isfinite(u)
+            if np.count_nonzero(there) >= FEWEST:
+                off = waveform.z[there] * np.exp(np.complex64(-2j * np.pi * frequency) * u[there])
+                return self._turned(off, len(fringes.fringes), "an earlier round")
+        return self._disagrees(fringes, waveform, sigma_z)
+
+    @staticmethod
+    def _turned(off: NDArray[np.complex64], count: int, whom: str) -> str:
+        near = np.pi / count
+        agree = float((np.abs(np.angle(off)) < near).mean())
+        if agree > _DISAGREED:
+            return ""
+        shares = [
+            (float((np.abs(np.angle(off * np.exp(-2j * np.pi * k / count))) < near).mean()), k) for k in range(count)
+        ]
+        share, k = max(shares)
+        if share < _AGREED:
+            return ""
+        return f"all phases are off by {360 * k / count:.0f}° from what {whom} found: the sequence began {k} steps off"
+
+    def _disagrees(self, fringes: FringeSequence, waveform: Waveform, sigma_z: float) -> str:
+        former = [
+            s
+            for s in self._shown
+            if s.round == self._round and s.axis == fringes.axis and s.frequency != fringes.frequency
+        ]
+        if len(former) < _UNWRAP_FROM:
+            return ""
+        # Heavy, and not needed before the fourth frequency of an axis.
+        from scipy.stats import chi2
+
+        from scanner.phasors import AxisPhasors
+        from scanner.unwrapping import modulation_trend, unwrap
+
+        usable = np.flatnonzero(np.logical_and.reduce([s.usable for s in former]) & waveform.usable)
+        if usable.size < FEWEST:
+            return ""
+        asked = usable[:: max(1, usable.size // _ASKED)]
+        frequencies = np.array([s.frequency for s in former] + [float(fringes.frequency or 0)])
+        z = np.stack([s.z[asked] for s in former] + [waveform.z[asked]])[:, None]
+        noise = np.full((1, asked.size), max(sigma_z, *(s.sigma_z for s in former)), np.float32)
+        extent = self._extent[fringes.axis]
+
+        def agreeing(parts: int) -> float:
+            phasors = AxisPhasors(fringes.axis, frequencies[:parts], np.ascontiguousarray(z[:parts]), 0.0)
+            found = unwrap(phasors, noise, extent, modulation_trend(phasors, noise))
+            return float((found.chi2 < chi2.isf(0.001, found.dof)).mean())
+
+        if agreeing(len(frequencies)) > _DISAGREED or agreeing(len(former)) < _AGREED:
+            return ""
+        return (
+            f"the phases fit no coordinate together with those of {len(former)} other sequences of axis {fringes.axis}: "
+            "pictures of another sequence, or in another order"
+        )
+
+
+def _lit_by(contrast: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(P,) pixels that the projector surely lights, however few of all they are."""
+    return np.asarray(contrast > max(0.25 * float(np.quantile(contrast, 0.995)), 8.0))
+
+
+def _diverse(z: NDArray[np.complex64]) -> bool:
+    """Whether phasors cover the whole circle of phases rather than a part of it."""
+    return bool(abs((z / np.abs(z)).mean()) < _DIVERSE)

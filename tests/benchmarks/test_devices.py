@@ -1,0 +1,156 @@
+"""How fast the devices' drivers are, and how little they disturb the rest of the program. Figures are printed."""
+
+import multiprocessing
+import os
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from cameras import counters, free_running, give_edges, plugged_in, running, shot, simulated, wait_for
+
+pytestmark = pytest.mark.bench
+
+STALL_S = 0.002
+
+
+class Watcher:
+    """A thread that only looks at the clock: the share of time in which it did not get to it for more than 2 ms.
+
+    ``share`` counts all such time, ``share_locked`` leaves out what the thread waited for a processor, as Linux counts
+    it: other programs on the machine are not the camera's fault, and the interpreter's lock is.
+    """
+
+    def __enter__(self):
+        self._stop = threading.Event()
+        self._stalled_s = self._locked_s = self.longest_locked_s = 0.0
+        self._thread = threading.Thread(target=self._watch)
+        self._began_s = time.perf_counter()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._stop.set()
+        self._thread.join()
+        took_s = time.perf_counter() - self._began_s
+        self.share, self.share_locked = self._stalled_s / took_s, self._locked_s / took_s
+
+    def _watch(self):
+        with open("/proc/thread-self/schedstat", "rb", buffering=0) as statistics:
+
+            def waited_s():
+                return int(os.pread(statistics.fileno(), 64, 0).split()[1]) * 1e-9
+
+            last = read_at = time.perf_counter()
+            waited = waited_s()
+            while not self._stop.is_set():
+                now = time.perf_counter()
+                gap, last = now - last, now
+                if gap > STALL_S:
+                    locked_s = gap - (waited_s() - waited)
+                    self._stalled_s += gap
+                    if locked_s > STALL_S:
+                        self._locked_s += locked_s
+                        self.longest_locked_s = max(self.longest_locked_s, locked_s)
+                if gap > STALL_S or now - read_at > 0.001:
+                    waited, read_at = waited_s(), now
+
+
+def report(*figures):
+    print("\n   ", *figures, file=sys.stderr, flush=True)
+
+
+def stalls(work, seconds=6.0):
+    """Share of time in which the interpreter's lock was not to be had, with the work; reported with and without."""
+    with Watcher() as alone:
+        time.sleep(seconds / 3)
+    with Watcher() as watcher:
+        work(seconds)
+    report(
+        f"another thread stalled > 2 ms: by the lock {watcher.share_locked:.2%} of the time (longest "
+        f"{watcher.longest_locked_s * 1e3:.1f} ms), in all {watcher.share:.1%}; without a camera "
+        f"{alone.share_locked:.2%}, in all {alone.share:.1%}"
+    )
+    return watcher.share_locked
+
+
+def paced(camera, out, rate_hz):
+    def work(seconds):
+        begin = time.monotonic()
+        for number in range(int(seconds * rate_hz)):
+            time.sleep(max(0.0, begin + number / rate_hz - time.monotonic()))
+            shot(camera, out)
+
+    return work
+
+
+@pytest.mark.parametrize(("size", "pixel_format"), [("1024x768", "Mono8"), ("4008x2688", "Mono12")])
+def test_camera_triggered_at_60_hz_stalls_no_other_thread(tmp_path, size, pixel_format):
+    with plugged_in(tmp_path, f"S::MFS Sim:{size}"), running(simulated(pixel_format=pixel_format)) as (camera, out):
+        report(f"{size} {pixel_format}, software trigger, 60 Hz where it can")
+        assert stalls(paced(camera, out, 60.0)) < 0.02
+
+
+def test_camera_that_runs_freely_stalls_no_other_thread():
+    rate = {"AcquisitionFrameRate": 60.0}
+    with running(free_running(width_px=800, height_px=800, features=rate)) as (camera, out):
+        report("viky 800x800 Mono8, free run at 60 Hz")
+        assert stalls(paced(camera, out, 20.0)) < 0.02
+
+
+@pytest.mark.parametrize(("size", "pixel_format"), [("1024x768", "Mono8"), ("4008x2688", "Mono12")])
+def test_camera_from_trigger_to_frame(tmp_path, size, pixel_format):
+    exposure_s = 0.001
+    with plugged_in(tmp_path, f"S::MFS Sim:{size}"), running(simulated(pixel_format=pixel_format)) as (camera, out):
+        shot(camera, out)
+        frames, delays, took = 60, [], []
+        begin = time.monotonic()
+        for _ in range(frames):
+            asked = time.monotonic()
+            stamp = shot(camera, out)
+            took.append(time.monotonic() - asked)
+            delays.append(stamp.t_host_s - stamp.t_device_s - exposure_s)
+        rate = frames / (time.monotonic() - begin)
+        report(
+            f"{size} {pixel_format}: {rate:.0f} frames/s step by step; trigger to frame median "
+            f"{np.median(took) * 1e3:.1f} ms, p99 {np.quantile(took, 0.99) * 1e3:.1f} ms; end of exposure to memory "
+            f"median {np.median(delays) * 1e3:.1f} ms, p99 {np.quantile(delays, 0.99) * 1e3:.1f} ms"
+        )
+        assert np.median(took) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("size", "pixel_format", "rate_hz"),
+    [("1024x768", "Mono8", 60.0), ("1024x768", "Mono8", 200.0), ("4008x2688", "Mono12", 10.0)],
+)
+def test_camera_in_a_burst_loses_nothing(tmp_path, size, pixel_format, rate_hz):
+    frames = int(3 * rate_hz)
+    world = tmp_path / "world"
+    bits = 8 if pixel_format == "Mono8" else 12
+    edges = multiprocessing.get_context("spawn").Process(
+        target=give_edges, args=(str(world), "S", frames, rate_hz, bits)
+    )
+    edges.start()
+    try:
+        wait_for(world.exists, within_s=20.0)
+        with plugged_in(tmp_path, f"S::MFS Sim:{size}", world):
+            camera = simulated(trigger="line", exposure_us=500.0, pixel_format=pixel_format)
+            with running(camera) as (camera, out):
+                camera.fetch(out, 20.0)
+                begin = time.monotonic()
+                with Watcher() as watcher:
+                    for _ in range(frames - 1):
+                        camera.fetch(out, 5.0)
+                took_s = time.monotonic() - begin
+                count = counters(camera)
+    finally:
+        edges.join(20.0)
+        edges.kill()
+    report(
+        f"{size} {pixel_format} on a line at {rate_hz:g} Hz: {(frames - 1) / took_s:.1f} frames/s, most in the ring "
+        f"{count['ring_high_water']}, {count['underrun']} underruns, {count['lost']} lost; another thread stalled by "
+        f"the lock {watcher.share_locked:.2%} of the time, in all {watcher.share:.1%}"
+    )
+    assert (count["delivered"], count["lost"], count["underrun"]) == (frames, 0, 0)
+    assert (frames - 1) / took_s > 0.95 * rate_hz

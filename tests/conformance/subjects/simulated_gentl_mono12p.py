@@ -1,0 +1,11 @@
+"""The simulated producer, triggered by software, Mono12p."""
+
+from contextlib import contextmanager
+
+from cameras import plugged_in, simulated
+
+
+@contextmanager
+def camera(tmp_path):
+    with plugged_in(tmp_path):
+        yield simulated(pixel_format="Mono12p")

@@ -1,0 +1,266 @@
+"""Faults in the middle of whole scans through the real drivers, on the virtual bench (one small world for all).
+
+Each scan ends in one of two ways: it took the broken sequence again and its coordinates are as good as without a
+fault, or it says what is wrong and what to do. Either way the take opens, the projector is dark, nothing is left over.
+Run with -s to see the table: fault, what was seen, what the operator reads, how long it took.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from requirements import require
+
+from drivers import DeviceBusyError, DeviceNotFoundError, HardwareError, OperatorError
+from scanner.acquisition import Acquisition, ScanState
+from scanner.config import ScanSection
+from scanner.decoding import Decoder
+from scanner.methods import METHODS
+from scanner.rig import Rig
+from scanner.take import Take, TakeWriter
+from sim_backend.gentl import Fault, plug, unplug
+from sim_backend.virtual_bench import CAMERA_SERIAL, open_bench, open_world
+from sim_backend.virtual_settings import VirtualSettings
+
+SETTINGS = {
+    "scene": {"name": "mirror"},
+    "camera": {"width_px": 160, "height_px": 120, "exposure_us": 5000, "white_dn": 600, "readout_s": 0.001},
+    "projector": {"width_px": 320, "height_px": 200, "refresh_hz": 100, "latency_s": 0.004},
+    "transport": {"photons": 100_000, "supersample": 1},
+    "trigger": "box",
+    "reconnect_s": 8,
+}
+FRINGES = {axis: [n / extent for n in range(16, 21)] for axis, extent in (("x", 320), ("y", 200))}
+SCAN = {"steps": 4, "attempts": 3, "frequencies_per_px": FRINGES}
+TABLE: list[tuple[str, str, str, float]] = []
+
+
+@pytest.fixture(scope="module")
+def world(transport_cache):
+    require(shutil.which("Xvfb"), "needs a virtual X server: apt-get install xvfb libgl1-mesa-dri")
+    require(shutil.which(os.environ.get("CC", "cc")), "needs a C compiler: apt-get install gcc libc6-dev")
+    settings = VirtualSettings.model_validate(SETTINGS)
+    with open_world(settings) as (process, ends):
+        yield World(settings, process, ends)
+    print_table()
+
+
+def print_table():
+    print("\n| fault | seen after | ends with | the operator reads |\n|---|---|---|---|")
+    for fault, ends, reads, seconds in TABLE:
+        print(f"| {fault} | {seconds:.2f} s | {ends} | {reads} |")
+
+
+@dataclass
+class World:
+    settings: VirtualSettings
+    process: object
+    ends: object
+
+    @property
+    def bus(self) -> Path:
+        """Folder that stands for the camera's bus."""
+        return Path(os.environ["MFS_SIM_GENTL_DIR"])
+
+    def upset_camera(self, fault, count=1):
+        assert self.process.call("upset_camera", fault, count)
+
+    def call(self, *args):
+        return self.process.call(*args)
+
+
+@dataclass
+class Saboteur:
+    """Listens to a scan and strikes when frame ``at`` of round ``round`` was taken."""
+
+    strike: object
+    round: int = 1
+    at: int = 7
+    notes: list = field(default_factory=list)
+    states: list = field(default_factory=list)
+    struck: float | None = None
+    noticed: float | None = None
+
+    def state(self, state, what):
+        self.states.append(state)
+        if state is ScanState.REPEATING and self.noticed is None:
+            self.noticed = time.monotonic()
+
+    def frame(self, progress):
+        done = (progress.sequence - 1) * progress.frames + progress.frame
+        if self.struck is None and progress.round == self.round and done == self.at:
+            self.struck = time.monotonic()
+            self.strike()
+
+    def note(self, text):
+        self.notes.append(text)
+
+
+@contextmanager
+def scan(world, folder, saboteur, **bench_changes):
+    """A scan that is ready to run; yields (bench, acquisition)."""
+    settings = world.settings.model_copy(update=bench_changes)
+    section, method = ScanSection.model_validate({"method": "mfs"} | SCAN), METHODS["mfs"]
+    with open_bench(settings, world.ends) as bench:
+        bench.timeout_s = 1.5  # the world's pictures are small
+        plan = method.first_round(section, bench.projector_size)
+        manifest = {"method": "mfs", "bench": {}, "config": {}, "plans": [plan.to_json()], "simulated": True}
+        with TakeWriter.create(
+            folder / "take", frame_format=bench.frame_format, slots=2 * plan.frame_count, manifest=manifest
+        ) as take:
+            decoder = Decoder(method, section, bench.noise, Rig.from_json(bench.rig))
+            yield bench, Acquisition(bench, method, section, decoder, take, saboteur)
+
+
+def leftovers():
+    """Processes below this one, without those that Python keeps for itself."""
+    return {
+        p.pid
+        for p in psutil.Process().children(recursive=True)
+        if "resource_tracker" not in " ".join(p.cmdline()) and "resource-tracker" not in p.name()
+    }
+
+
+@pytest.fixture
+def clean(world):
+    """Nothing that a scan has started is left when it is over, and the surface is dark."""
+    before, shared = leftovers(), set(os.listdir("/dev/shm"))
+    yield
+    assert leftovers() <= before
+    assert set(os.listdir("/dev/shm")) <= shared
+    time.sleep(0.1)
+    assert world.call("shown").max() == 0
+
+
+@pytest.fixture(scope="module")
+def sound(world, tmp_path_factory):
+    """Coordinates of a scan without a fault."""
+    watcher = Saboteur(lambda: None)
+    with scan(world, tmp_path_factory.mktemp("sound"), watcher) as (_, job):
+        maps = job.run()
+    assert ScanState.REPEATING not in watcher.states
+    assert np.isfinite(maps.x_p).mean() > 0.5
+    assert maps.lit.any()  # there is a second round
+    return maps
+
+
+def agree(maps, sound):
+    """Two scans of one scene differ by noise, three pixels in a thousand by more than 3 σ; some edges by their side."""
+    difference = np.abs(maps.x_p - sound.x_p)
+    noise = np.hypot(maps.sigma_x, sound.sigma_x)
+    both = np.isfinite(difference)
+    assert both.sum() > 0.97 * np.isfinite(sound.x_p).sum()
+    assert (difference[both] > 3 * noise[both]).mean() < 0.01
+
+
+RECOVERED = {
+    "no frame": lambda w: w.upset_camera(Fault.MISS_TRIGGER),
+    "frame lost": lambda w: w.upset_camera(Fault.DROP),
+    "frame incomplete": lambda w: w.upset_camera(Fault.INCOMPLETE),
+    "frame cut short, unsaid": lambda w: w.upset_camera(Fault.TRUNCATE),
+    "frame of wrong size": lambda w: w.upset_camera(Fault.WRONG_SIZE),
+    "frame delivered twice": lambda w: w.upset_camera(Fault.DUPLICATE),
+    "pixels of the frame before": lambda w: w.upset_camera(Fault.REPEAT),
+    "torn frame": lambda w: w.upset_camera(Fault.TEAR),
+    "frame ids jump": lambda w: w.upset_camera(Fault.ID_JUMP),
+    "camera unplugged and back": lambda w: unplug(w.bus, CAMERA_SERIAL, away_s=1.0),
+    "producer crashes": lambda w: w.upset_camera(Fault.CRASH),
+    "display shows the former picture": lambda w: w.call("freeze", 0.12),
+    "lamp off for a moment": lambda w: (w.call("black_out", True), time.sleep(0.06), w.call("black_out", False)),
+    "trigger box: garbled reply": lambda w: w.call("upset_box_wire", "garble_replies", 9),
+    "trigger box: reboots": lambda w: w.call("reboot_box", 0.5),
+    "trigger box: unplugged and back": lambda w: (w.call("unplug_box"), w.call("plug_in_box")),
+}
+
+
+@pytest.mark.parametrize("fault", RECOVERED)
+def test_sequence_is_taken_again(world, clean, sound, tmp_path, fault):
+    saboteur = Saboteur(lambda: RECOVERED[fault](world), round=2 if "unplugged" in fault else 1)
+    with scan(world, tmp_path, saboteur) as (_, job):
+        maps = job.run()
+    assert saboteur.struck is not None
+    agree(maps, sound)
+    take = Take.open(tmp_path / "take")
+    assert take.status == "completed"
+    assert not take.missing(1)
+    assert not take.missing(2)
+    if fault not in ("trigger box: garbled reply",):  # a line that is asked for again costs nothing
+        assert ScanState.REPEATING in saboteur.states, saboteur.notes
+        assert "sequence_aborted" in (tmp_path / "take" / "journal.jsonl").read_text()
+    seconds = (saboteur.noticed or saboteur.struck) - saboteur.struck
+    TABLE.append((fault, "taken again", saboteur.notes[0] if saboteur.notes else "nothing: repaired", seconds))
+
+
+ENDED = {
+    "camera unplugged for good": (lambda w: unplug(w.bus, CAMERA_SERIAL), DeviceNotFoundError, "camera"),
+    "trigger box silent": (lambda w: w.call("upset_box_wire", "silent", True), HardwareError, "box"),
+    "projector dark for good": (lambda w: w.call("black_out", True), HardwareError, "failed its check"),
+}
+
+
+@pytest.mark.parametrize("fault", ENDED)
+def test_scan_ends_and_says_why(world, clean, tmp_path, fault):
+    strike, kind, says = ENDED[fault]
+    saboteur = Saboteur(lambda: strike(world))
+    try:
+        with pytest.raises(kind, match=says) as caught, scan(world, tmp_path, saboteur, reconnect_s=1.0) as (_, job):
+            job.run()
+        seconds = time.monotonic() - saboteur.struck
+    finally:
+        plug(world.bus, CAMERA_SERIAL)
+        world.call("upset_box_wire", "silent", False)
+        world.call("black_out", False)
+    assert caught.value.exit_code == 3
+    assert caught.value.remedy
+    take = Take.open(tmp_path / "take")
+    assert take.status == "failed"
+    assert take.sequences(1)  # what was sound before is kept
+    TABLE.append((fault, "error, exit code 3", str(caught.value).replace("\n", " "), seconds))
+
+
+def test_full_disk_ends_the_scan_and_keeps_what_was_sound(world, clean, tmp_path, monkeypatch):
+    write = os.pwrite
+
+    def full(fd, data, offset):
+        if saboteur.struck is not None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(fd, data, offset)
+
+    saboteur = Saboteur(lambda: monkeypatch.setattr(os, "pwrite", full))
+    with pytest.raises(OperatorError, match="No space left") as caught, scan(world, tmp_path, saboteur) as (_, job):
+        job.run()
+    seconds = time.monotonic() - saboteur.struck
+    assert Take.open(tmp_path / "take").sequences(1)
+    TABLE.append(("disk full", f"error, exit code {caught.value.exit_code}", str(caught.value), seconds))
+
+
+def test_slow_disk_only_takes_longer(world, clean, sound, tmp_path, monkeypatch):
+    write = os.pwrite
+
+    def slow(fd, data, offset):
+        time.sleep(0.05)
+        return write(fd, data, offset)
+
+    monkeypatch.setattr(os, "pwrite", slow)
+    with scan(world, tmp_path, Saboteur(lambda: None)) as (_, job):
+        agree(job.run(), sound)
+    assert not job.repeats
+
+
+def test_camera_that_another_process_holds_is_named(world, clean, tmp_path):
+    with (
+        open_bench(world.settings, world.ends),
+        pytest.raises(DeviceBusyError, match=CAMERA_SERIAL) as caught,
+        open_bench(world.settings, world.ends),
+    ):
+        pass
+    TABLE.append(("another process holds the camera", "error before the scan", str(caught.value), 0.0))
