@@ -201,14 +201,23 @@ class DeviceBench:
             return
         counts = self.trigger.counts()
         exposed = sent if counts.exposed is None else counts.exposed
-        if (counts.sent, exposed, counts.missed) != (sent, sent, 0):
-            back = "not counted" if counts.exposed is None else str(counts.exposed)
-            raise SequenceFaultError(
-                f"{self.trigger.name}: {counts.sent} pulses sent, {counts.missed} missed, exposures counted back: "
-                f"{back}; {sent} frames came for {sent} patterns",
-                "Check the cables between box and camera; exposure and read-out must be shorter than the time between "
-                "two pulses.",
+        if counts.missed:
+            remedy = "Pulses were asked for too fast: make min_period_us of the box as short as the camera allows."
+        elif counts.sent != sent:
+            remedy = "Check the wire and the light sensor at the box's input: it has not seen each pattern once."
+        elif exposed != sent:
+            remedy = (
+                "Check the wires between box and camera; exposure and read-out must be shorter than the time between "
+                "two pulses."
             )
+        else:
+            return
+        back = "not counted" if counts.exposed is None else str(counts.exposed)
+        raise SequenceFaultError(
+            f"{self.trigger.name}: {counts.sent} pulses sent, {counts.missed} missed, exposures counted back: {back}; "
+            f"{sent} frames came for {sent} patterns",
+            remedy,
+        )
 
     def _recover(self) -> None:
         deadline = self.clock.now() + self.reconnect_s
@@ -217,14 +226,11 @@ class DeviceBench:
                 try:
                     self._ready(device)
                     break
-                except HardwareError as error:
-                    away = isinstance(error, DeviceLostError | DeviceNotFoundError)
-                    if away and self.clock.now() < deadline:
-                        self.clock.sleep(_RETRY_S)
-                        continue
-                    # It has been waited for: to take the sequence again would only wait once more.
-                    error.repeatable = error.repeatable and not away
-                    raise
+                except (DeviceLostError, DeviceNotFoundError) as error:
+                    if self.clock.now() >= deadline:
+                        # It has been waited for: to take the sequence again would only wait once more.
+                        raise _given_up(device, self.reconnect_s, error) from error
+                    self.clock.sleep(_RETRY_S)
         self._disturbed = False
 
     def _ready(self, device: Device) -> None:
@@ -269,3 +275,12 @@ class DeviceBench:
             # A box that does not answer has no more pulses to give; closing it comes next.
             with suppress(OperatorError):
                 self.trigger.stop()
+
+
+def _given_up(device: Device, waited_s: float, error: HardwareError) -> DeviceLostError:
+    lost = DeviceLostError(
+        f"{device.name} was lost in mid-scan and is not back after {waited_s:g} s: {error.message}",
+        error.remedy,
+    )
+    lost.repeatable = False
+    return lost

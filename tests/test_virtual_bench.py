@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from virtual import SMALL, photographed, require_virtual_bench, sequence, small
+from virtual import SMALL, all_photographed, photographed, require_virtual_bench, sequence, small
 
 from drivers import HardwareError
 from drivers.examination import Verdict
@@ -106,6 +106,19 @@ def test_coordinates_are_as_good_as_in_process(virtual, truth, parts, axis):
     assert (error[clean & known] / sigma[clean & known]).std() == pytest.approx(1, abs=0.20)
     # In the small region a single wrong pixel would make a standard deviation; the median says what is typical.
     assert np.median(np.abs(error[region & known]) / sigma[region & known]) == pytest.approx(0.674, abs=0.14)
+
+
+def test_with_the_same_noise_frames_are_those_of_the_simulation_in_process_to_the_last_bit(transport_cache):
+    """Window, X server, GenTL and all that is between them change nothing in a pattern or a frame."""
+    settings = SCENE | {"camera": {"width_px": 256, "height_px": 192, "electrons_per_dn": 40.0}, "seed": 9}
+    columns = np.arange(1280)
+    waves = [np.rint(127.5 + 127.5 * np.cos(columns / 3 + step)).astype(np.uint8) for step in range(4)]
+    frames = []
+    for bench_kind, model in ((simulated, SimulatedSettings), (kind, VirtualSettings)):
+        with bench_kind.open(model.model_validate(settings)) as bench:
+            bench.prepare([np.tile(wave, (800, 1)) for wave in waves])
+            frames.append(all_photographed(bench, waves)[0])
+    np.testing.assert_array_equal(*frames)
 
 
 def test_its_cloud_agrees_with_the_one_in_process_within_noise(virtual, in_process, parts):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import threading
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -20,7 +21,7 @@ import psutil
 import pytest
 from requirements import require
 
-from drivers import DeviceBusyError, DeviceNotFoundError, HardwareError, OperatorError
+from drivers import DeviceBusyError, DeviceLostError, HardwareError, OperatorError
 from scanner.acquisition import Acquisition, ScanState
 from scanner.config import ScanSection
 from scanner.decoding import Decoder
@@ -162,6 +163,10 @@ def agree(maps, sound):
     assert (difference[both] > 3 * noise[both]).mean() < 0.01
 
 
+def later(seconds, call):
+    threading.Timer(seconds, call).start()
+
+
 RECOVERED = {
     "no frame": lambda w: w.upset_camera(Fault.MISS_TRIGGER),
     "frame lost": lambda w: w.upset_camera(Fault.DROP),
@@ -175,7 +180,7 @@ RECOVERED = {
     "camera unplugged and back": lambda w: unplug(w.bus, CAMERA_SERIAL, away_s=1.0),
     "producer crashes": lambda w: w.upset_camera(Fault.CRASH),
     "display shows the former picture": lambda w: w.call("freeze", 0.12),
-    "lamp off for a moment": lambda w: (w.call("black_out", True), time.sleep(0.06), w.call("black_out", False)),
+    "lamp off for a moment": lambda w: (w.call("black_out", True), later(0.1, lambda: w.call("black_out", False))),
     "trigger box: garbled reply": lambda w: w.call("upset_box_wire", "garble_replies", 9),
     "trigger box: reboots": lambda w: w.call("reboot_box", 0.5),
     "trigger box: unplugged and back": lambda w: (w.call("unplug_box"), w.call("plug_in_box")),
@@ -201,7 +206,7 @@ def test_sequence_is_taken_again(world, clean, sound, tmp_path, fault):
 
 
 ENDED = {
-    "camera unplugged for good": (lambda w: unplug(w.bus, CAMERA_SERIAL), DeviceNotFoundError, "camera"),
+    "camera unplugged for good": (lambda w: unplug(w.bus, CAMERA_SERIAL), DeviceLostError, "camera SIM0001 was lost"),
     "trigger box silent": (lambda w: w.call("upset_box_wire", "silent", True), HardwareError, "box"),
     "projector dark for good": (lambda w: w.call("black_out", True), HardwareError, "failed its check"),
 }

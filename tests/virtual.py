@@ -41,7 +41,8 @@ def photographed(bench, index):
 
 def all_photographed(bench, patterns):
     """Frames and stamps of the prepared sequence."""
-    return zip(*[photographed(bench, index) for index in range(len(patterns))], strict=True)
+    pairs = [photographed(bench, index) for index in range(len(patterns))]
+    return [frame for frame, _ in pairs], [stamp for _, stamp in pairs]
 
 
 def sequence(bench, patterns, attempts=5):

@@ -160,9 +160,13 @@ def test_deeper_pixels_arrive_whole(bench, patterns, bits, packed):
     np.testing.assert_array_equal(frame, patterns[0].astype(np.uint16) << (bits - 8))
 
 
-def test_the_trigger_box_exposes_and_counts_back(bench, patterns):
+def test_the_trigger_box_exposes_and_counts_back(world, bench, patterns):
     with bench(trigger="box") as boxed:
+        before = world[0].call("counts")
         frames, _ = sequence(boxed, patterns)
+        after = world[0].call("counts")
+        for what in ("pulses", "pictures", "changes"):
+            assert after[what] - before[what] == SEQUENCE
         for frame, pattern in zip(frames, patterns, strict=True):
             np.testing.assert_array_equal(frame, pattern)
         counts = boxed.trigger.counts()
@@ -217,6 +221,14 @@ class TestStreamed:
         assert fault.value.repeatable
         frames, _ = sequence(streamed, patterns)
         assert len(frames) == SEQUENCE
+
+
+def test_the_display_refreshes_at_its_rate(world):
+    counts, began = world[0].call("counts"), time.monotonic()
+    time.sleep(0.5)
+    later, ended = world[0].call("counts"), time.monotonic()
+    refreshes = sum(later[what] - counts[what] for what in ("scan_outs", "skipped"))
+    assert refreshes == pytest.approx((ended - began) / PERIOD, abs=2)
 
 
 def test_settings_that_cannot_work_are_refused():
