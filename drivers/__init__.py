@@ -17,6 +17,7 @@ from drivers.devices import (
     SequencePlayer,
     Trigger,
     TriggerCounts,
+    WatchedProjector,
 )
 from drivers.errors import (
     DeviceBusyError,
@@ -70,4 +71,5 @@ __all__ = [
     "SystemClock",
     "Trigger",
     "TriggerCounts",
+    "WatchedProjector",
 ]

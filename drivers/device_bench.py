@@ -22,6 +22,7 @@ from drivers.devices import (
     Pixels,
     Projector,
     Trigger,
+    WatchedProjector,
 )
 from drivers.errors import (
     DeviceLostError,
@@ -184,8 +185,8 @@ class DeviceBench:
             **devices,
         }
 
-    def check_counts(self, sent: int) -> None:
-        """Refuse the sequence unless as many pulses were sent and exposures made as frames have come.
+    def check_sequence(self, sent: int) -> None:
+        """Refuse a sequence that was disturbed, or of which other pulses and exposures were counted than frames came.
 
         Parameters
         ----------
@@ -195,8 +196,10 @@ class DeviceBench:
         Raises
         ------
         SequenceFaultError
-            The box has counted something else.
+            The box has counted something else, or something came before a picture.
         """
+        if isinstance(self.projector, WatchedProjector):
+            self.projector.verify()
         if self.trigger is None:
             return
         counts = self.trigger.counts()

@@ -316,6 +316,23 @@ class SequencePlayer(Projector, Protocol):
 
 
 @runtime_checkable
+class WatchedProjector(Projector, Protocol):
+    """A projector that notices when its picture is disturbed, such as a window that others can cover."""
+
+    def verify(self) -> None:
+        """Say that nothing has disturbed a picture since the sequence was loaded.
+
+        Raises
+        ------
+        SequenceFaultError
+            Something has; the sequence may be repeated.
+        DeviceLostError
+            The picture is gone.
+        """
+        ...
+
+
+@runtime_checkable
 class Trigger(Device, Protocol):
     """A box that gives trigger pulses to the camera. ``open → configure → (arm → fire* → counts → stop)* → close``."""
 

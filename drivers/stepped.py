@@ -38,5 +38,5 @@ class SteppedBench(DeviceBench):
         self._fired += 1
         stamp = self.camera.fetch(out, self.exposure_s + self.timeout_s)
         if index == self._patterns - 1:
-            self.check_counts(self._fired)
+            self.check_sequence(self._fired)
         return replace(stamp, t_shown_s=shown)

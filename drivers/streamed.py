@@ -78,4 +78,4 @@ class StreamedBench(DeviceBench):
                 f"late ({numbers}{', …' if len(record.late) > 8 else ''})",
                 "Close other programs, switch off the compositor, or scan step by step.",
             )
-        self.check_counts(self._patterns)
+        self.check_sequence(self._patterns)

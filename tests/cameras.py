@@ -13,7 +13,7 @@ import numpy as np
 import psutil
 from requirements import require
 
-from drivers import MissingLibraryError, SystemClock
+from drivers import HardwareError, MissingLibraryError, SystemClock
 from drivers.genicam import GenICamCamera, GenICamSettings
 
 
@@ -103,6 +103,20 @@ def shot(camera, out, timeout_s=2.0):
     """Trigger and fetch; returns the stamp."""
     camera.trigger()
     return camera.fetch(out, timeout_s)
+
+
+def shot_until_fault(camera, out, timeout_s=2.0):
+    """Trigger and fetch until a fault shows: one that was injected reaches the camera a moment later.
+
+    Returns the stamp of the last good frame and the error.
+    """
+    stamp = None
+    for _ in range(100):
+        try:
+            stamp = shot(camera, out, timeout_s)
+        except HardwareError as error:
+            return stamp, error
+    raise AssertionError("no fault came")
 
 
 def counters(camera):

@@ -93,7 +93,10 @@ class GenICamCamera:
             self._identity = self._process.call("connect", producer, timeout_s=wait_s)
         except DeviceLostError as error:
             self._process.stop()
-            raise DeviceLostError(f"{error.message}, while {producer} was looking for it", error.remedy) from None
+            raise DeviceLostError(
+                f"{error.message}, while {producer} was looking for it",
+                "Check the camera's cable and power; where this is not its vendor's producer, name that as `producer`.",
+            ) from None
         except BaseException:
             self._process.stop()
             raise
@@ -213,7 +216,8 @@ class GenICamCamera:
     def describe(self) -> Mapping[str, Any]:
         """JSON-ready: identity, settings, what the camera rounded, its features when it was armed, and counters."""
         if self._life.state not in (DeviceState.CLOSED, DeviceState.FAULT):
-            self._counters = self._call("counters")
+            with contextlib.suppress(DeviceLostError):
+                self._counters = self._call("counters")
         identity = {} if self._identity is None else asdict(self._identity) | {"producer": str(self._identity.producer)}
         return {
             "name": self.name,

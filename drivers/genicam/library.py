@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import re
 import signal
 import sys
 import threading
@@ -52,9 +53,7 @@ def is_genicam_error(error: BaseException) -> bool:
 
 def reason(error: BaseException) -> str:
     """What an exception of the binding says, without the places in its source code that it mentions."""
-    text = " ".join(str(error).split())
-    for noise in (" : ", " (file '"):
-        text = text.partition(noise)[0]
+    text = re.sub(r" ?: \w+Exception thrown in .*$", "", " ".join(str(error).split()))
     return text.rstrip(". ") or type(error).__name__
 
 

@@ -66,6 +66,7 @@ class Projector(Scripted):
     size = (6, 4)
     period_s = 0.02
     late = ()
+    disturbed = None
 
     def configure(self):
         self.move("configure", "configure")
@@ -78,6 +79,10 @@ class Projector(Scripted):
         self.move(f"show {index}")
         self.shown = index
         return self.clock.now()
+
+    def verify(self):
+        if self.disturbed:
+            raise self.disturbed
 
     def play(self):
         self.move("play")
@@ -216,6 +221,17 @@ def test_triggers_exposures_and_frames_must_agree(parts, kind, counts):
             take(bench)
         assert caught.value.repeatable
         devices["trigger"].report = None
+        take(bench)
+
+
+@pytest.mark.parametrize("kind", [SteppedBench, StreamedBench])
+def test_disturbed_picture_is_told_with_the_last_frame(parts, kind):
+    devices, _ = parts
+    with kind(name="b", settle_s=0.1, **devices) as bench:
+        devices["projector"].disturbed = SequenceFaultError("projector: it was covered by: mail", "move it away")
+        with pytest.raises(SequenceFaultError, match="covered by: mail"):
+            take(bench)
+        devices["projector"].disturbed = None
         take(bench)
 
 

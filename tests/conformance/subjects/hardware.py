@@ -4,11 +4,13 @@ import os
 from contextlib import contextmanager
 
 if config_file := os.environ.get("MFS_SCANNER_HARDWARE"):
-    from drivers import SystemClock
+    from drivers import SequencePlayer, SystemClock
     from drivers.hardware import SoftwareTrigger, make_projector, make_trigger
     from scanner.config import load_config
 
     settings = load_config(config_file).config.bench.settings
+
+    PLAYS = isinstance(make_projector(settings.projector, SystemClock()), SequencePlayer)
 
     if settings.camera.trigger != "line":
 
