@@ -149,6 +149,8 @@ class DeviceBench:
     def prepare(self, patterns: Sequence[NDArray[np.uint8]]) -> None:
         """Bring back what was lost, forget what a broken sequence has left, and load the patterns."""
         self._recover()
+        if self.projector.state is DeviceState.RUNNING:
+            self.projector.darken()  # a sequence that was not photographed to its end
         self.projector.load(patterns)
         self._patterns = len(patterns)
         self._prepared()

@@ -12,6 +12,9 @@ from drivers.device_bench import DeviceBench
 from drivers.devices import FrameStamp, Pixels, SequencePlayer
 from drivers.errors import FrameLossError, SequenceFaultError
 
+_LONG_LATENCY_S = 0.3
+"""Longer than displays are late; taken where nobody has measured."""
+
 
 @dataclass
 class StreamedBench(DeviceBench):
@@ -24,6 +27,7 @@ class StreamedBench(DeviceBench):
 
     _next: int = field(default=0, init=False)
     _last_id: int | None = field(default=None, init=False)
+    _changed_s: float = field(default=float("-inf"), init=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.projector, SequencePlayer):
@@ -60,17 +64,31 @@ class StreamedBench(DeviceBench):
         return stamp
 
     @property
+    def _settled_after_s(self) -> float:
+        if self.settle_s is not None:
+            return self.settle_s
+        return _LONG_LATENCY_S if self.latency is None else self.latency.settle_s(self.projector.period_s)
+
+    @property
     def _wait_s(self) -> float:
         """From play to the first frame, s."""
         return self.exposure_s + self.timeout_s + (1.0 if self.latency is None else self.latency.p99_s)
 
+    def darken(self) -> None:
+        """Project black."""
+        super().darken()
+        self._changed_s = self.clock.now()
+
     def _begin(self) -> None:
+        # What was handed over last may still be on its way to the light sensor, and would give the first edge.
+        self.clock.sleep(self._changed_s + self._settled_after_s - self.clock.now())
         if self.trigger is not None:
             self.trigger.arm(self._patterns)
         self._player.play()
 
     def _check_played(self) -> None:
         record = self._player.finish(self.timeout_s)
+        self._changed_s = self.clock.now()
         if record.late:
             numbers = ", ".join(str(n + 1) for n in record.late[:8])
             raise SequenceFaultError(

@@ -102,7 +102,7 @@ class Display:
 
     def _run(self) -> None:
         _go_before_others()
-        refresh = math.floor(time.monotonic() / self._period)
+        refresh = math.floor(time.monotonic() / self._period - self._phase)
         while True:
             refresh += 1
             moment = (refresh + self._phase) * self._period

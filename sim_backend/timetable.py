@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 
 class Timetable:
-    """Does what it is told at the moment it is told, one after the other; a context manager."""
+    """Does what it is told at the moment it is told, one after the other."""
 
     def __init__(self) -> None:
         self._due: list[tuple[float, int, Callable[[], None]]] = []

@@ -149,7 +149,7 @@ def hardware_settings(settings: VirtualSettings, ends: WireEnds) -> HardwareSett
         if boxed
         else SoftwareTrigger(),
         synchronisation=settings.synchronisation,
-        settle_s=projector.latency_s + 2 * period_s if settings.settle_s is None else settings.settle_s,
+        settle_s=projector.latency_s + 1.5 * period_s if settings.settle_s is None else settings.settle_s,
         reconnect_s=settings.reconnect_s,
         whole_refreshes=False,  # this light is steady within a refresh
     )

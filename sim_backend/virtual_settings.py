@@ -51,7 +51,7 @@ class VirtualSettings(SceneSettings):
         None,
         ge=0,
         le=60,
-        description="From the hand-over of a picture to the trigger, s; left out, the latency and two refreshes.",
+        description="From the hand-over of a picture to the trigger, s; left out, the latency and 1.5 refreshes.",
     )
     reconnect_s: float = Field(
         20.0, ge=0, le=3600, description="How long a device that was lost in a scan is waited for, s."

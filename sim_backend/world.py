@@ -84,9 +84,9 @@ class World:
             size = settings.projector.width_px, settings.projector.height_px
             self._screen = stack.enter_context(XServer(*size))
             self._surface = Surface(np.zeros(size[::-1], np.uint8))
+            self._box = stack.enter_context(SltBoxEmulator(on_pulse=self._pulse))
             self._lines = Timetable()
             stack.callback(self._lines.close)
-            self._box = stack.enter_context(SltBoxEmulator(on_pulse=self._pulse))
             self._pictures = stack.enter_context(PictureServer(Path(folder) / "pictures", self, exposed=self._exposed))
             self._display = Display(
                 self._screen.channel("green"),

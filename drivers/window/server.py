@@ -75,6 +75,7 @@ class WindowServer:
         self._refresh_s = 0.0
         self._content: tuple[int | None, bool] = None, False
         self._exposed = False
+        self._flipped_s = 0.0
         self._unfocused = 0
         self._next_examination = 0.0
         self._next_key = 0.0
@@ -258,6 +259,9 @@ class WindowServer:
             return now
         period, phase = self._refresh_s, self._settings.timer_phase_ms * 1e-3
         due = (math.floor((now - phase) / period) + 1) * period + phase
+        if due - self._flipped_s < 0.75 * period:
+            # As with a screen's refresh, a late flip moves the next ones: two within one would lose a picture.
+            due += period
         time.sleep(due - now)
         return due
 
@@ -276,7 +280,8 @@ class WindowServer:
         gl.glClear(gl.GL_COLOR_BUFFER_BIT)
         gl.glDisable(gl.GL_SCISSOR_TEST)
         gl.glFinish()
-        return time.monotonic()
+        self._flipped_s = time.monotonic()
+        return self._flipped_s
 
     def _flip_now(self) -> None:
         self._draw()

@@ -127,9 +127,9 @@ def test_the_camera_holds_up_no_other_thread(world, patterns):
             with Watcher() as watcher, suppress(HardwareError):
                 all_photographed(bench, patterns)
             bench.darken()
-            shares["without"].append(without.share)
-            shares["with"].append(watcher.share)
-            longest = max(longest, watcher.longest_s)
+            shares["without"].append(without.share_locked)
+            shares["with"].append(watcher.share_locked)
+            longest = max(longest, watcher.longest_locked_s)
     beside, alone = (float(np.median(shares[which])) for which in ("with", "without"))
     report(f"stalled > 2 ms: {beside:.2%} of the time, {alone:.2%} without the camera; longest {longest * 1e3:.1f} ms")
     assert beside - alone < 0.02

@@ -43,6 +43,7 @@ def test_opening(server):
     device.configure()
     print(f"\nopen {opened - begin:.2f} s, configure {time.monotonic() - opened:.2f} s")
     device.close()
+    assert opened - begin < 5.0
 
 
 def test_flips_per_second(device):
@@ -89,3 +90,4 @@ def test_showing_one_after_the_other(device, server):
         took.append(time.monotonic() - begin)
     print(f"\nshow() takes {np.median(took) * 1e3:.1f} ms, 99 % within {np.quantile(took, 0.99) * 1e3:.1f} ms")
     assert np.array_equal(server.channel(), sequence[119 % 12])
+    assert np.median(took) < 2 / 60

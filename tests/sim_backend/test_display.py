@@ -36,6 +36,11 @@ class Watched:
         return self.changes[-1]
 
     @property
+    def refresh_s(self):
+        """One refresh, longer by those that a busy machine has made the display miss, and by being late for one."""
+        return PERIOD * (1 + self.display.skipped) + 0.006
+
+    @property
     def levels(self):
         return [int(picture[0, 0]) for _, picture in self.changes]
 
@@ -54,7 +59,7 @@ def test_a_picture_comes_on_the_latency_after_the_next_scan_out(watched):
     moment, _ = watched.wait_for(1)
     scanned = moment - LATENCY
     # The display may look a little later than it says.
-    assert -0.005 <= scanned - written <= PERIOD + 0.002
+    assert -0.005 <= scanned - written <= watched.refresh_s
     # Half a period after a multiple of it, on the machine's monotonic clock.
     assert (scanned / PERIOD) % 1 == pytest.approx(0.5, abs=1e-6)
     ((share, picture),) = watched.surface.during(moment, moment + 0.001)
@@ -87,25 +92,25 @@ def test_frozen_it_keeps_its_picture(watched):
     thawed = time.monotonic() + 0.2
     watched.write(90)
     moment, _ = watched.wait_for(1)
-    assert thawed <= moment - LATENCY <= thawed + 2 * PERIOD
+    assert thawed - 0.005 <= moment - LATENCY <= thawed + watched.refresh_s
 
 
 def test_a_dropped_change_comes_a_refresh_later(watched):
     watched.display.drop(1)
     first = watched.write(90)
     moment, _ = watched.wait_for(1)
-    assert PERIOD <= moment - LATENCY - first <= 2 * PERIOD + 0.002
+    assert PERIOD - 0.005 <= moment - LATENCY - first <= PERIOD + watched.refresh_s
     assert watched.display.dropped == 1
     second = watched.write(30)
     moment, _ = watched.wait_for(2)
-    assert moment - LATENCY - second <= PERIOD + 0.002
+    assert moment - LATENCY - second <= watched.refresh_s
 
 
 def test_latency_can_change(watched):
     watched.display.latency_s = 0.1
     written = watched.write(90)
     moment, _ = watched.wait_for(1)
-    assert 0.1 <= moment - written <= 0.1 + PERIOD + 0.002
+    assert 0.095 <= moment - written <= 0.1 + watched.refresh_s
 
 
 def test_blacked_out_nothing_is_on_the_surface_and_the_picture_comes_back(watched):
@@ -132,5 +137,5 @@ def test_who_asks_early_is_let_wait_until_the_surface_is_known(watched):
     end = time.monotonic() + 2 * PERIOD
     watched.display.catch_up(end)
     # Scanned out up to there, and not much later.
-    assert end - PERIOD - 0.005 <= time.monotonic() <= end + PERIOD
+    assert end - PERIOD - 0.005 <= time.monotonic() <= end + watched.refresh_s
     assert [int(p[0, 0]) for _, p in watched.surface.during(end - 0.001, end)] == [90]

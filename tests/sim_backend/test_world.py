@@ -82,6 +82,15 @@ class TestStepByStep:
         frame, _ = photographed(stepped, 5)
         np.testing.assert_array_equal(frame, patterns[5])
 
+    def test_a_refresh_that_was_missed_is_within_the_settle_time(self, stepped, world, patterns):
+        stepped.prepare(patterns)
+        photographed(stepped, 3)
+        before = world[0].call("counts")["dropped"]
+        world[0].call("drop", 1)
+        frame, _ = photographed(stepped, 4)
+        assert world[0].call("counts")["dropped"] == before + 1
+        np.testing.assert_array_equal(frame, patterns[4])
+
     def test_a_display_slower_than_the_settle_time_shows_the_pattern_before(self, stepped, world, patterns):
         stepped.prepare(patterns)
         photographed(stepped, 3)
