@@ -40,8 +40,7 @@ SETTINGS = {
     "trigger": "box",
     "reconnect_s": 8,
 }
-FRINGES = {axis: [n / extent for n in range(16, 21)] for axis, extent in (("x", 320), ("y", 200))}
-SCAN = {"steps": 4, "attempts": 3, "frequencies_per_px": FRINGES}
+SCAN = {"steps": 4, "attempts": 3, "axes": ["x"], "frequencies_per_px": [n / 320 for n in range(16, 21)]}
 TABLE: list[tuple[str, str, str, float]] = []
 
 

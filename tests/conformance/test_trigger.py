@@ -187,11 +187,11 @@ def test_describes_itself_in_every_state(subject):
 def test_leaves_nothing_behind(subject):
     box, give_edges, _ = subject
     process = psutil.Process(os.getpid())
-    threads, files = threading.active_count(), process.num_fds()
+    before = threading.active_count(), process.num_fds(), process.children()
     for _ in range(3):
         box.open()
         box.configure()
         box.arm(2)
         give_edges(1)
         box.close()
-    assert (threading.active_count(), process.num_fds(), process.children()) == (threads, files, [])
+    assert (threading.active_count(), process.num_fds(), process.children()) == before
