@@ -57,7 +57,7 @@ def world(transport_cache):
 def print_table():
     print("\n| fault | seen after | ends with | the operator reads |\n|---|---|---|---|")
     for fault, ends, reads, seconds in TABLE:
-        print(f"| {fault} | {seconds:.2f} s | {ends} | {reads} |")
+        print(f"| {fault} | {seconds:.2f} s | {ends} | {' '.join(reads.split())} |")
 
 
 @dataclass
@@ -106,19 +106,24 @@ class Saboteur:
 
 
 @contextmanager
-def scan(world, folder, saboteur, **bench_changes):
-    """A scan that is ready to run; yields (bench, acquisition)."""
-    settings = world.settings.model_copy(update=bench_changes)
-    section, method = ScanSection.model_validate({"method": "mfs"} | SCAN), METHODS["mfs"]
-    with open_bench(settings, world.ends) as bench:
+def opened(world, **changes):
+    """The real drivers, ready to scan."""
+    with open_bench(world.settings.model_copy(update=changes), world.ends) as bench:
         bench.timeout_s = 1.5  # the world's pictures are small
-        plan = method.first_round(section, bench.projector_size)
-        manifest = {"method": "mfs", "bench": {}, "config": {}, "plans": [plan.to_json()], "simulated": True}
-        with TakeWriter.create(
-            folder / "take", frame_format=bench.frame_format, slots=2 * plan.frame_count, manifest=manifest
-        ) as take:
-            decoder = Decoder(method, section, bench.noise, Rig.from_json(bench.rig))
-            yield bench, Acquisition(bench, method, section, decoder, take, saboteur)
+        yield bench
+
+
+def scan(bench, folder, listener):
+    """Scan on an open bench; returns (acquisition, maps)."""
+    section, method = ScanSection.model_validate({"method": "mfs"} | SCAN), METHODS["mfs"]
+    plan = method.first_round(section, bench.projector_size)
+    manifest = {"method": "mfs", "bench": {}, "config": {}, "plans": [plan.to_json()], "simulated": True}
+    with TakeWriter.create(
+        folder / "take", frame_format=bench.frame_format, slots=2 * plan.frame_count, manifest=manifest
+    ) as take:
+        decoder = Decoder(method, section, bench.noise, Rig.from_json(bench.rig))
+        job = Acquisition(bench, method, section, decoder, take, listener)
+        return job, job.run()
 
 
 def leftovers():
@@ -130,7 +135,7 @@ def leftovers():
     }
 
 
-@pytest.fixture
+@pytest.fixture(scope="class")
 def clean(world):
     """Nothing that a scan has started is left when it is over, and the surface is dark."""
     before, shared = leftovers(), set(os.listdir("/dev/shm"))
@@ -141,12 +146,18 @@ def clean(world):
     assert world.call("shown").max() == 0
 
 
-@pytest.fixture(scope="module")
-def sound(world, tmp_path_factory):
+@pytest.fixture(scope="class")
+def bench(world, clean):
+    """One bench for all faults that a scan survives: what one of them leaves behind, the next would stumble over."""
+    with opened(world) as bench:
+        yield bench
+
+
+@pytest.fixture(scope="class")
+def sound(bench, tmp_path_factory):
     """Coordinates of a scan without a fault."""
     watcher = Saboteur(lambda: None)
-    with scan(world, tmp_path_factory.mktemp("sound"), watcher) as (_, job):
-        maps = job.run()
+    _, maps = scan(bench, tmp_path_factory.mktemp("sound"), watcher)
     assert ScanState.REPEATING not in watcher.states
     assert np.isfinite(maps.x_p).mean() > 0.5
     assert maps.lit.any()  # there is a second round
@@ -186,22 +197,32 @@ RECOVERED = {
 }
 
 
-@pytest.mark.parametrize("fault", RECOVERED)
-def test_sequence_is_taken_again(world, clean, sound, tmp_path, fault):
-    saboteur = Saboteur(lambda: RECOVERED[fault](world), round=2 if "unplugged" in fault else 1)
-    with scan(world, tmp_path, saboteur) as (_, job):
-        maps = job.run()
-    assert saboteur.struck is not None
-    agree(maps, sound)
-    take = Take.open(tmp_path / "take")
-    assert take.status == "completed"
-    assert not take.missing(1)
-    assert not take.missing(2)
-    if fault not in ("trigger box: garbled reply",):  # a line that is asked for again costs nothing
+class TestSequenceIsTakenAgain:
+    @pytest.mark.parametrize("fault", RECOVERED)
+    def test_and_the_result_is_as_good(self, world, bench, sound, tmp_path, fault):
+        saboteur = Saboteur(lambda: RECOVERED[fault](world), round=2 if "unplugged" in fault else 1)
+        _, maps = scan(bench, tmp_path, saboteur)
+        assert saboteur.struck is not None
+        agree(maps, sound)
+        take = Take.open(tmp_path / "take")
+        assert take.status == "completed"
+        assert not take.missing(1)
+        assert not take.missing(2)
         assert ScanState.REPEATING in saboteur.states, saboteur.notes
         assert "sequence_aborted" in (tmp_path / "take" / "journal.jsonl").read_text()
-    seconds = (saboteur.noticed or saboteur.struck) - saboteur.struck
-    TABLE.append((fault, "taken again", saboteur.notes[0] if saboteur.notes else "nothing: repaired", seconds))
+        TABLE.append((fault, "taken again", saboteur.notes[0], saboteur.noticed - saboteur.struck))
+
+    def test_slow_disk_only_takes_longer(self, bench, sound, tmp_path, monkeypatch):
+        write = os.pwrite
+
+        def slow(fd, data, offset):
+            time.sleep(0.05)
+            return write(fd, data, offset)
+
+        monkeypatch.setattr(os, "pwrite", slow)
+        job, maps = scan(bench, tmp_path, Saboteur(lambda: None))
+        agree(maps, sound)
+        assert not job.repeats
 
 
 ENDED = {
@@ -211,60 +232,46 @@ ENDED = {
 }
 
 
-@pytest.mark.parametrize("fault", ENDED)
-def test_scan_ends_and_says_why(world, clean, tmp_path, fault):
-    strike, kind, says = ENDED[fault]
-    saboteur = Saboteur(lambda: strike(world))
-    try:
-        with pytest.raises(kind, match=says) as caught, scan(world, tmp_path, saboteur, reconnect_s=1.0) as (_, job):
-            job.run()
+class TestScanEndsAndSaysWhy:
+    @pytest.mark.parametrize("fault", ENDED)
+    def test_it(self, world, clean, tmp_path, fault):
+        strike, kind, says = ENDED[fault]
+        saboteur = Saboteur(lambda: strike(world))
+        try:
+            with pytest.raises(kind, match=says) as caught, opened(world, reconnect_s=1.0) as bench:
+                scan(bench, tmp_path, saboteur)
+            seconds = time.monotonic() - saboteur.struck
+        finally:
+            plug(world.bus, CAMERA_SERIAL)
+            world.call("upset_box_wire", "silent", False)
+            world.call("black_out", False)
+        assert caught.value.exit_code == 3
+        assert caught.value.remedy
+        take = Take.open(tmp_path / "take")
+        assert take.status == "failed"
+        assert take.sequences(1)  # what was sound before is kept
+        TABLE.append((fault, "error, exit code 3", str(caught.value), seconds))
+
+    def test_full_disk(self, world, clean, tmp_path, monkeypatch):
+        write = os.pwrite
+
+        def full(fd, data, offset):
+            if saboteur.struck is not None:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return write(fd, data, offset)
+
+        saboteur = Saboteur(lambda: monkeypatch.setattr(os, "pwrite", full))
+        with pytest.raises(OperatorError, match="No space left") as caught, opened(world) as bench:
+            scan(bench, tmp_path, saboteur)
         seconds = time.monotonic() - saboteur.struck
-    finally:
-        plug(world.bus, CAMERA_SERIAL)
-        world.call("upset_box_wire", "silent", False)
-        world.call("black_out", False)
-    assert caught.value.exit_code == 3
-    assert caught.value.remedy
-    take = Take.open(tmp_path / "take")
-    assert take.status == "failed"
-    assert take.sequences(1)  # what was sound before is kept
-    TABLE.append((fault, "error, exit code 3", str(caught.value).replace("\n", " "), seconds))
+        assert Take.open(tmp_path / "take").sequences(1)
+        TABLE.append(("disk full", f"error, exit code {caught.value.exit_code}", str(caught.value), seconds))
 
-
-def test_full_disk_ends_the_scan_and_keeps_what_was_sound(world, clean, tmp_path, monkeypatch):
-    write = os.pwrite
-
-    def full(fd, data, offset):
-        if saboteur.struck is not None:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return write(fd, data, offset)
-
-    saboteur = Saboteur(lambda: monkeypatch.setattr(os, "pwrite", full))
-    with pytest.raises(OperatorError, match="No space left") as caught, scan(world, tmp_path, saboteur) as (_, job):
-        job.run()
-    seconds = time.monotonic() - saboteur.struck
-    assert Take.open(tmp_path / "take").sequences(1)
-    TABLE.append(("disk full", f"error, exit code {caught.value.exit_code}", str(caught.value), seconds))
-
-
-def test_slow_disk_only_takes_longer(world, clean, sound, tmp_path, monkeypatch):
-    write = os.pwrite
-
-    def slow(fd, data, offset):
-        time.sleep(0.05)
-        return write(fd, data, offset)
-
-    monkeypatch.setattr(os, "pwrite", slow)
-    with scan(world, tmp_path, Saboteur(lambda: None)) as (_, job):
-        agree(job.run(), sound)
-    assert not job.repeats
-
-
-def test_camera_that_another_process_holds_is_named(world, clean, tmp_path):
-    with (
-        open_bench(world.settings, world.ends),
-        pytest.raises(DeviceBusyError, match=CAMERA_SERIAL) as caught,
-        open_bench(world.settings, world.ends),
-    ):
-        pass
-    TABLE.append(("another process holds the camera", "error before the scan", str(caught.value), 0.0))
+    def test_camera_that_another_process_holds(self, world, clean):
+        with (
+            opened(world),
+            pytest.raises(DeviceBusyError, match=CAMERA_SERIAL) as caught,
+            opened(world),
+        ):
+            pass
+        TABLE.append(("another process holds the camera", "error before the scan", str(caught.value), 0.0))
