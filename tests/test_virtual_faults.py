@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import signal
 import threading
 import time
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from desktop import Desktop
 from requirements import require
 
 from drivers import DeviceBusyError, DeviceLostError, HardwareError, OperatorError
@@ -41,7 +43,7 @@ SETTINGS = {
     "reconnect_s": 8,
 }
 SCAN = {"steps": 4, "attempts": 3, "axes": ["x"], "frequencies_per_px": [n / 320 for n in range(16, 21)]}
-TABLE: list[tuple[str, str, str, float]] = []
+TABLE: list[tuple[str, str, float, float | None, str]] = []
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +57,10 @@ def world(transport_cache):
 
 
 def print_table():
-    print("\n| fault | seen after | ends with | the operator reads |\n|---|---|---|---|")
-    for fault, ends, reads, seconds in TABLE:
-        print(f"| {fault} | {seconds:.2f} s | {ends} | {' '.join(reads.split())} |")
+    print("\n| fault | seen after | then | goes on after | the operator reads |\n|---|---|---|---|---|")
+    for fault, ends, seen, again, reads in TABLE:
+        goes_on = "–" if again is None else f"{again:.2f} s"
+        print(f"| {fault} | {seen:.2f} s | {ends} | {goes_on} | {' '.join(reads.split())} |")
 
 
 @dataclass
@@ -89,6 +92,7 @@ class Saboteur:
     states: list = field(default_factory=list)
     struck: float | None = None
     noticed: float | None = None
+    again: float | None = None
 
     def state(self, state, what):
         self.states.append(state)
@@ -96,6 +100,8 @@ class Saboteur:
             self.noticed = time.monotonic()
 
     def frame(self, progress):
+        if self.noticed is not None and self.again is None:
+            self.again = time.monotonic()
         done = (progress.sequence - 1) * progress.frames + progress.frame
         if self.struck is None and progress.round == self.round and done == self.at:
             self.struck = time.monotonic()
@@ -197,10 +203,23 @@ RECOVERED = {
 }
 
 
+MEDDLING = {
+    "closed": Desktop.ask_to_close,
+    "hidden": Desktop.hide,
+    "destroyed": Desktop.destroy,
+    "moved": lambda desktop: desktop.move(10, 5),
+    "covered for a moment": lambda desktop: desktop.uncover(desktop.cover(10, 10, 80, 60)),
+}
+
+
 class TestSequenceIsTakenAgain:
     @pytest.mark.parametrize("fault", RECOVERED)
     def test_and_the_result_is_as_good(self, world, bench, sound, tmp_path, fault):
-        saboteur = Saboteur(lambda: RECOVERED[fault](world), round=2 if "unplugged" in fault else 1)
+        self.survive(fault, lambda: RECOVERED[fault](world), bench, sound, tmp_path)
+
+    @staticmethod
+    def survive(fault, strike, bench, sound, tmp_path):
+        saboteur = Saboteur(strike, round=2 if "unplugged" in fault else 1)
         _, maps = scan(bench, tmp_path, saboteur)
         assert saboteur.struck is not None
         agree(maps, sound)
@@ -210,7 +229,17 @@ class TestSequenceIsTakenAgain:
         assert not take.missing(2)
         assert ScanState.REPEATING in saboteur.states, saboteur.notes
         assert "sequence_aborted" in (tmp_path / "take" / "journal.jsonl").read_text()
-        TABLE.append((fault, "taken again", saboteur.notes[0], saboteur.noticed - saboteur.struck))
+        struck, noticed, again = saboteur.struck, saboteur.noticed, saboteur.again
+        TABLE.append((fault, "taken again", noticed - struck, again - noticed, saboteur.notes[0]))
+
+    @pytest.mark.parametrize("deed", MEDDLING)
+    def test_when_somebody_meddles_with_the_window(self, world, bench, sound, tmp_path, deed):
+        with Desktop(world.ends.display) as desktop:
+            self.survive(f"window {deed}", lambda: MEDDLING[deed](desktop), bench, sound, tmp_path)
+
+    def test_when_the_window_s_process_dies(self, bench, sound, tmp_path):
+        kill = lambda: os.kill(bench.projector.pid, signal.SIGKILL)  # noqa: E731
+        self.survive("window's process dies", kill, bench, sound, tmp_path)
 
     def test_slow_disk_only_takes_longer(self, bench, sound, tmp_path, monkeypatch):
         write = os.pwrite
@@ -250,7 +279,7 @@ class TestScanEndsAndSaysWhy:
         take = Take.open(tmp_path / "take")
         assert take.status == "failed"
         assert take.sequences(1)  # what was sound before is kept
-        TABLE.append((fault, "error, exit code 3", str(caught.value), seconds))
+        TABLE.append((fault, "error, exit code 3", seconds, None, str(caught.value)))
 
     def test_full_disk(self, world, clean, tmp_path, monkeypatch):
         write = os.pwrite
@@ -265,7 +294,7 @@ class TestScanEndsAndSaysWhy:
             scan(bench, tmp_path, saboteur)
         seconds = time.monotonic() - saboteur.struck
         assert Take.open(tmp_path / "take").sequences(1)
-        TABLE.append(("disk full", f"error, exit code {caught.value.exit_code}", str(caught.value), seconds))
+        TABLE.append(("disk full", f"error, exit code {caught.value.exit_code}", seconds, None, str(caught.value)))
 
     def test_camera_that_another_process_holds(self, world, clean):
         with (
@@ -274,4 +303,4 @@ class TestScanEndsAndSaysWhy:
             opened(world),
         ):
             pass
-        TABLE.append(("another process holds the camera", "error before the scan", str(caught.value), 0.0))
+        TABLE.append(("another process holds the camera", "error before the scan", 0.0, None, str(caught.value)))
