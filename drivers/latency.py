@@ -117,6 +117,8 @@ def measure_latency(
     """
     width, height = projector.size
     projector.load([np.zeros((height, width), np.uint8), np.full((height, width), 255, np.uint8)])
+    if trigger is not None:
+        trigger.arm()
     frame = np.empty(frame_format.shape, frame_format.dtype)
 
     def photograph() -> float:
