@@ -336,6 +336,11 @@ class WatchedProjector(Projector, Protocol):
 class Trigger(Device, Protocol):
     """A box that gives trigger pulses to the camera. ``open → configure → (arm → fire* → counts → stop)* → close``."""
 
+    @property
+    def min_period_s(self) -> float:
+        """Shortest time between two pulses, s."""
+        ...
+
     def configure(self) -> None:
         """Apply the settings the box was made with."""
         ...

@@ -121,9 +121,14 @@ def measure_latency(
         trigger.arm()
     frame = np.empty(frame_format.shape, frame_format.dtype)
 
+    earliest = clock.now()
+
     def photograph() -> float:
         """Time of the trigger, s; the frame is in ``frame``."""
+        nonlocal earliest
+        clock.sleep(earliest - clock.now())
         asked = clock.now()
+        earliest = asked + (0.0 if trigger is None else 1.1 * trigger.min_period_s)
         if trigger is None:
             camera.trigger()
         else:

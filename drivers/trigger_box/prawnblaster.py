@@ -73,6 +73,11 @@ class PrawnBlasterBox:
         self._sent = self._missed = self._stray = 0
 
     @property
+    def min_period_s(self) -> float:
+        """A pulse and as much time after it, s."""
+        return 2 * self._settings.pulse_us * 1e-6
+
+    @property
     def state(self) -> DeviceState:
         """How far the device has come."""
         return self._life.state

@@ -62,6 +62,11 @@ class SltTriggerBox:
         self._status: Status | None = None
 
     @property
+    def min_period_s(self) -> float:
+        """What `min_period_us` says, s."""
+        return self._settings.min_period_us * 1e-6
+
+    @property
     def state(self) -> DeviceState:
         """How far the device has come."""
         return self._life.state

@@ -124,6 +124,7 @@ class Camera(Scripted):
 
 
 class Box(Scripted):
+    min_period_s = 0.01
     report = None
     sent = 0
 
