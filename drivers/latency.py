@@ -128,11 +128,11 @@ def measure_latency(
         nonlocal earliest
         clock.sleep(earliest - clock.now())
         asked = clock.now()
-        earliest = asked + (0.0 if trigger is None else 1.1 * trigger.min_period_s)
         if trigger is None:
             camera.trigger()
         else:
             trigger.fire()
+            earliest = clock.now() + trigger.min_period_s
         camera.fetch(frame, exposure_s + _PATIENCE_S)
         return asked
 
