@@ -45,7 +45,7 @@ bench: $(BENCH)  ## speed, as ratios to a peer and to reading the frames once
 	$(BIN)/python -m pytest tests/benchmarks -m bench -s
 
 soak: $(READY)   ## two thousand scans' worth of sequences with random faults
-	MFS_SCANNER_SOAK=2000 $(BIN)/python -m pytest tests/test_soak.py -s
+	$(BIN)/python -m pytest tests/test_soak.py -m bench -s
 
 clean:           ## forget the environment and the demo's output
 	rm -rf $(VENV) demo-result demo-comparison virtual-bench-result

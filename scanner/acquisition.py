@@ -185,7 +185,11 @@ class Acquisition:
                 if second_plan is not None:
                     found = self.decoder.maps
                     self._history.begin_round(
-                        second_plan.size, coordinates=(found.x_p, found.y_p), lit=second_plan.mask
+                        second_plan.size,
+                        levels=self._levels(second_plan),
+                        saturated_dn=self.bench.frame_format.saturated_dn,
+                        coordinates=(found.x_p, found.y_p),
+                        lit=second_plan.mask,
                     )
                     second = self._capture(2, second_plan, first_plan.frame_count + second_plan.frame_count)
                     self._enter(ScanState.DECODING, "decoding round 2")
@@ -244,9 +248,17 @@ class Acquisition:
 
     def _preflight(self, plan: Plan) -> tuple[Pixels, Pixels]:
         """Look at the brightest and the darkest picture before anything is measured; returns their frames."""
+        bright, dark = self._levels(plan)
+        check_exposure(bright, dark, self.bench.frame_format.saturated_dn, self.scan.max_saturated_share)
+        return bright, dark
+
+    def _levels(self, plan: Plan) -> tuple[Pixels, Pixels]:
+        """Frames under the brightest and the darkest level of the fringes, where the plan lights at all."""
         width, height = self.bench.projector_size
         levels = (plan.mean + plan.amplitude, plan.mean - plan.amplitude)
         pictures = [np.full((height, width), round(255 * level), np.uint8) for level in levels]
+        if plan.mask is not None:
+            pictures = [np.where(plan.mask, picture, np.uint8(0)) for picture in pictures]
         fmt = self.bench.frame_format
         bright, dark = (np.empty(fmt.shape, fmt.dtype) for _ in range(2))
         for attempt in range(1, self.scan.attempts + 1):
@@ -260,7 +272,6 @@ class Acquisition:
                     raise
                 self._note(f"exposure check: {error.message}; it was made again")
         self.bench.darken()
-        check_exposure(bright, dark, fmt.saturated_dn, self.scan.max_saturated_share)
         return bright, dark
 
     def _capture(self, number: int, plan: Plan, total: int) -> RoundFrames:

@@ -101,7 +101,7 @@ def process_images(
             raise ImagesError(
                 f"{recorded.folder}: the images {names[0]} to {names[-1]} do not show sequence "
                 f"{number + 1} ({fringes.label}): "
-                + "; ".join(f"{names[f.frame]}: {f.message}" for f in found.findings),
+                + "; ".join(f.message if f.frame < 0 else f"{names[f.frame]}: {f.message}" for f in found.findings),
                 "Correct the order of `files` or of `sequences`, or the phase convention, in the plan file.",
             )
         frames.add(number, pixels)

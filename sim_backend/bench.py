@@ -35,7 +35,7 @@ class SimulatedBenchKind:
 
         optics = Optics.of(settings, transport_of(settings))
         clock = VirtualClock(real_time=settings.real_time)
-        projector = SimulatedProjector(settings.projector, clock)
+        projector = SimulatedProjector(settings.projector, clock, settings.faults)
         camera = SimulatedCamera(
             settings.camera, optics, projector, clock, np.random.default_rng(settings.seed), settings.faults
         )

@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from drivers import (
     DeviceLostError,
+    DeviceNotFoundError,
     DeviceSettingError,
     DeviceState,
     FrameFormat,
+    FrameLossError,
     FrameStamp,
     FrameTimeoutError,
     Lifecycle,
@@ -21,6 +24,7 @@ from drivers import (
     Pixels,
 )
 from sim_backend.clock import VirtualClock
+from sim_backend.faults import Fault, FaultSchedule, WrongExposure
 from sim_backend.optics import Optics, Sensor
 from sim_backend.settings import CameraSettings, FaultSettings, ProjectorSettings
 from sim_backend.surface import Picture, Surface
@@ -37,9 +41,16 @@ class SimulatedProjector:
         Of the projector.
     clock
         The bench's time; refreshes happen at its multiples of the period.
+    faults
+        What goes wrong, and when.
+
+    Attributes
+    ----------
+    asked
+        (height, width) the picture that was asked for last, whether it came on or not.
     """
 
-    def __init__(self, settings: ProjectorSettings, clock: VirtualClock) -> None:
+    def __init__(self, settings: ProjectorSettings, clock: VirtualClock, faults: FaultSettings | None = None) -> None:
         self.name = "simulated projector"
         self._settings = settings
         self._clock = clock
@@ -47,6 +58,11 @@ class SimulatedProjector:
         self._pictures: list[Picture] = []
         self._black = np.zeros((settings.height_px, settings.width_px), np.uint8)
         self._surface = Surface(self._black)
+        self.asked = self._black
+        self._faults = faults or FaultSettings()
+        self._schedule = FaultSchedule.of_pictures(self._faults)
+        self._shown = 0
+        self._failing: tuple[Fault, int] | None = None
 
     @property
     def state(self) -> DeviceState:
@@ -62,6 +78,11 @@ class SimulatedProjector:
     def period_s(self) -> float:
         """Time one picture is on at least, s."""
         return 1 / self._settings.refresh_hz
+
+    @property
+    def fault(self) -> Fault | None:
+        """What is the matter with the picture that was shown last."""
+        return self._failing[0] if self._failing else None
 
     def open(self) -> None:
         """Switch on."""
@@ -97,11 +118,26 @@ class SimulatedProjector:
                 f"{self.name}: there is no picture {index} among the {len(self._pictures)} loaded ones",
                 "Load the sequence again before it is shown.",
             )
-        return self._hand_over(self._pictures[index])
+        former, self.asked = self.asked, self._pictures[index]
+        self._shown, number = self._shown + 1, self._shown
+        match self._fault_of(number):
+            case Fault.FREEZE:
+                return self._clock.now()
+            case Fault.LAG:
+                return self._hand_over(former)
+        return self._hand_over(self.asked)
+
+    def _fault_of(self, number: int) -> Fault | None:
+        if self._failing is None or number >= self._failing[1]:
+            fault = self._schedule.at(number)
+            lasting = self._faults.freeze_pictures if fault is Fault.FREEZE else self._faults.lag_pictures
+            self._failing = None if fault is None else (fault, number + lasting)
+        return self.fault
 
     def darken(self) -> None:
         """Show black."""
         self._life.require("darken", *(s for s in DeviceState if s is not DeviceState.CLOSED))
+        self.asked = self._black
         self._hand_over(self._black)
 
     def close(self) -> None:
@@ -139,6 +175,17 @@ class SimulatedProjector:
         return self._surface.during(begin, end, stale=stale)
 
 
+@dataclass(frozen=True)
+class _Exposure:
+    """One that was triggered: its number, when it begins, its and the projector's fault, and what should be seen."""
+
+    number: int
+    begin: float
+    fault: Fault | None
+    projector_fault: Fault | None
+    asked: Picture
+
+
 class SimulatedCamera:
     """Photographs what the projector has on the surface.
 
@@ -156,6 +203,11 @@ class SimulatedCamera:
         Makes the noise.
     faults
         What goes wrong, and when.
+
+    Attributes
+    ----------
+    wrong_exposures
+        Those that did not show what the projector was asked for. Tests compare with it; nothing else may.
     """
 
     def __init__(
@@ -176,9 +228,12 @@ class SimulatedCamera:
         self._random = random
         self._faults = faults
         self._life = Lifecycle(self.name)
-        self._exposures = 0
-        self._pending: deque[tuple[int, float]] = deque()
+        self._schedule = FaultSchedule.of_exposures(faults)
+        self._exposures = self._opened_at = 0
+        self._away_until = -math.inf
+        self._pending: deque[_Exposure] = deque()
         self._former: Pixels | None = None
+        self.wrong_exposures: list[WrongExposure] = []
 
     @property
     def state(self) -> DeviceState:
@@ -195,10 +250,24 @@ class SimulatedCamera:
         """Exposure time, s."""
         return self._settings.exposure_us * 1e-6
 
+    @property
+    def exposures(self) -> int:
+        """How many were triggered since the camera was made."""
+        return self._exposures
+
     def open(self) -> None:
-        """Connect."""
+        """Connect.
+
+        Raises
+        ------
+        DeviceNotFoundError
+            The camera was unplugged, and is not back yet.
+        """
+        self._life.check("open")
+        if self._clock.now() < self._away_until:
+            raise DeviceNotFoundError(f"{self.name} is not there", "Check its cable and power.")
         self._life.move("open")
-        self._exposures = 0
+        self._opened_at = self._exposures
 
     def configure(self) -> FrameFormat:
         """Say what frames will look like."""
@@ -223,18 +292,20 @@ class SimulatedCamera:
             The camera is set to be lost at this exposure.
         """
         self._life.require("trigger", DeviceState.RUNNING)
-        number = self._exposures
-        if number == self._faults.lose_camera_at:
+        number, begin = self._exposures, self._clock.now()
+        self._exposures += 1
+        fault = self._schedule.at(number)
+        if fault is Fault.LOST:
+            back = self._faults.camera_back_after_s
+            self._away_until = math.inf if back is None else begin + back
             self._life.move("fail")
             raise DeviceLostError(
                 f"{self.name} does not answer any more (exposure {number})",
                 "Check its cable and power, then start again.",
             )
-        begin = self._clock.now()
         if self._pending:
-            begin = max(begin, self._pending[-1][1] + self.exposure_s)
-        self._pending.append((number, begin))
-        self._exposures += 1
+            begin = max(begin, self._pending[-1].begin + self.exposure_s)
+        self._pending.append(_Exposure(number, begin, fault, self._projector.fault, self._projector.asked))
 
     def fetch(self, out: Pixels, timeout_s: float) -> FrameStamp:
         """Wait for the oldest frame that was triggered and write it to ``out`` (height, width).
@@ -243,6 +314,8 @@ class SimulatedCamera:
         ------
         FrameTimeoutError
             It does not come within ``timeout_s``.
+        FrameLossError
+            It is incomplete, or its number says that others were lost.
         DeviceSettingError
             ``out`` is no place for such a frame.
         """
@@ -254,26 +327,73 @@ class SimulatedCamera:
                 "Allocate frames in the format that configure() returned.",
             )
         deadline = self._clock.now() + timeout_s
-        number, begin = self._pending[0] if self._pending else (self._exposures, math.inf)
-        ready = begin + self.exposure_s + self._settings.readout_s
-        dropped = bool(self._pending) and number in self._faults.drop_at
-        if dropped or ready > deadline:
-            if dropped:
+        exposure = self._pending[0] if self._pending else None
+        ready = math.inf if exposure is None else self._ready_at(exposure)
+        if exposure is None or ready > deadline:
+            if ready == math.inf and self._pending:
                 self._pending.popleft()
             self._clock.sleep_until(deadline)
+            number = self._exposures if exposure is None else exposure.number
             raise FrameTimeoutError(
                 f"{self.name}: no frame within {timeout_s:g} s (exposure {number})",
                 "Check that the trigger reaches the camera, and that the timeout exceeds exposure and read-out.",
             )
         self._clock.sleep_until(ready)
         self._pending.popleft()
-        if number in self._faults.repeat_frame_at and self._former is not None:
+        if exposure.fault in (Fault.INCOMPLETE, Fault.ID_JUMP):
+            what = "is incomplete" if exposure.fault is Fault.INCOMPLETE else "is not the next one: frames were lost"
+            raise FrameLossError(
+                f"{self.name}: frame {exposure.number} {what}",
+                "The sequence is to be taken again; where this happens often, check the cable and the bandwidth.",
+            )
+        self._photograph(exposure, out)
+        return FrameStamp(exposure.number - self._opened_at, exposure.begin, self._clock.now())
+
+    def _ready_at(self, exposure: _Exposure) -> float:
+        """When the frame is there, s."""
+        if exposure.fault is Fault.DROP:
+            return math.inf
+        late = self._faults.late_s if exposure.fault is Fault.LATE else 0.0
+        return exposure.begin + self.exposure_s + self._settings.readout_s + late
+
+    def _photograph(self, exposure: _Exposure, out: Pixels) -> None:
+        """Write what the exposure has seen to ``out``, and what it should have seen into the books."""
+        fault, scale = exposure.fault, np.float32(self._sensor.scale)
+        shown = self._seen(exposure)
+        right = [(1.0, exposure.asked)]
+        seen = self._optics.grey(shown)
+        if fault is Fault.FLICKER:
+            seen = seen + np.float32(self._schedule.between(0, self._faults.flicker_dn))
+        expected = seen * scale
+        if fault is Fault.REPEAT and self._former is not None:
             out[...] = self._former
+            expected = self._former.astype(np.float32)
         else:
-            shown = self._projector.on_surface(begin, begin + self.exposure_s, stale=number in self._faults.stale_at)
-            self._sensor.digitise(self._optics.grey(shown), self._random, out)
-            self._former = out.copy()
-        return FrameStamp(frame_id=number, t_device_s=begin, t_host_s=self._clock.now())
+            self._sensor.digitise(seen, self._random, out)
+        if fault is Fault.CUT:
+            first = int(self._schedule.between(0.1, 0.95) * len(out))
+            out[first:] = 0
+            expected = np.concatenate([expected[:first], np.zeros_like(expected[first:])])
+        self._former = out.copy()
+        if fault is not None or any(picture is not exposure.asked for _, picture in shown):
+            error = np.asarray(expected - self._optics.grey(right) * scale, np.float32)
+            if np.any(error):
+                faults = tuple(f for f in (fault, exposure.projector_fault) if f is not None)
+                self.wrong_exposures.append(WrongExposure(exposure.number, faults, error))
+
+    def _seen(self, exposure: _Exposure) -> list[tuple[float, Picture]]:
+        """Shares of the exposure, and the pictures that were on the surface meanwhile."""
+        end = exposure.begin + self.exposure_s
+        shown = self._projector.on_surface(exposure.begin, end, stale=exposure.fault is Fault.STALE)
+        if exposure.fault not in (Fault.TORN, Fault.MIXED, Fault.DARK_FLASH):
+            return shown
+        before = self._projector.on_surface(exposure.begin, end, stale=True)[-1][1]
+        now = shown[-1][1]
+        if exposure.fault is Fault.TORN:
+            rows = int(self._schedule.between(0.05, 0.95) * len(now))
+            return [(1.0, np.concatenate([now[:rows], before[rows:]]))]
+        share = self._schedule.between(0.02, 0.7)
+        return [(share, before if exposure.fault is Fault.MIXED else np.zeros_like(now)), (1 - share, now)]
 
     def stop(self) -> None:
         """No more triggers."""

@@ -98,13 +98,54 @@ class TransportSettings(_Section):
     diffuse_bounces: int = Field(2, ge=0, le=8, description="Reflections followed where one of them is diffuse.")
 
 
+_Rate = Annotated[float, Field(ge=0, le=1)]
+
+
+class FaultRates(_Section):
+    """Faults at random: the probability of each at every exposure, or at every picture that is shown."""
+
+    seed: int = Field(0, ge=0, description="Seed of the faults: the same seed gives the same ones.")
+    repeat_frame: _Rate = Field(0.0, description="The camera hands out its former frame once more.")
+    stale: _Rate = Field(0.0, description="The projector still shows the picture before.")
+    torn: _Rate = Field(0.0, description="A part of the picture's rows still is the picture before.")
+    mixed: _Rate = Field(0.0, description="The picture changes during the exposure.")
+    cut: _Rate = Field(0.0, description="The frame's last rows are missing, and nobody says so.")
+    dark_flash: _Rate = Field(0.0, description="The projector is dark during a part of the exposure.")
+    flicker: _Rate = Field(0.0, description="The room is brighter during the exposure.")
+    drop: _Rate = Field(0.0, description="The frame never arrives.")
+    late: _Rate = Field(0.0, description="The frame arrives `late_s` too late.")
+    incomplete: _Rate = Field(0.0, description="The camera reports the frame as incomplete.")
+    id_jump: _Rate = Field(0.0, description="The camera's frame numbers jump: frames were lost.")
+    lose_camera: _Rate = Field(0.0, description="The camera is unplugged.")
+    freeze: _Rate = Field(0.0, description="The projector does not change its picture for a while.")
+    lag: _Rate = Field(0.0, description="The projector shows each picture one late for a while.")
+
+
 class FaultSettings(_Section):
-    """Faults to provoke, each a list of exposures counted from 0 since the bench was opened."""
+    """Faults to provoke: lists of exposures or of pictures, counted from 0 since the bench was opened, or rates."""
 
     repeat_frame_at: tuple[_Count, ...] = Field((), description="The camera hands out its former frame once more.")
     stale_at: tuple[_Count, ...] = Field((), description="The projector still shows the picture before.")
+    torn_at: tuple[_Count, ...] = Field((), description="A part of the picture's rows still is the picture before.")
+    mixed_at: tuple[_Count, ...] = Field((), description="The picture changes during the exposure.")
+    cut_at: tuple[_Count, ...] = Field((), description="The frame's last rows are missing, and nobody says so.")
+    dark_flash_at: tuple[_Count, ...] = Field((), description="The projector is dark during a part of the exposure.")
+    flicker_at: tuple[_Count, ...] = Field((), description="The room is brighter during the exposure.")
+    flicker_dn: float = Field(20.0, ge=0, description="By how much at most, grey value of the 8-bit scale.")
     drop_at: tuple[_Count, ...] = Field((), description="The frame never arrives.")
+    late_at: tuple[_Count, ...] = Field((), description="The frame arrives `late_s` too late.")
+    late_s: float = Field(5.0, ge=0, le=1000, description="How late a late frame arrives, s.")
+    incomplete_at: tuple[_Count, ...] = Field((), description="The camera reports the frame as incomplete.")
+    id_jump_at: tuple[_Count, ...] = Field((), description="The camera's frame numbers jump: frames were lost.")
     lose_camera_at: _Count | None = Field(None, description="The camera is unplugged at this exposure.")
+    camera_back_after_s: float | None = Field(
+        None, ge=0, description="After this time it is plugged in again, s; left out, it stays away."
+    )
+    freeze_at: tuple[_Count, ...] = Field((), description="Pictures from which on the projector stands still.")
+    freeze_pictures: int = Field(15, ge=1, description="For so many pictures.")
+    lag_at: tuple[_Count, ...] = Field((), description="Pictures from which on the projector is one picture late.")
+    lag_pictures: int = Field(30, ge=1, description="For so many pictures.")
+    rates: FaultRates = Field(FaultRates(), description="Faults at random.")
 
 
 class SceneSettings(_Section):

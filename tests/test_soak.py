@@ -10,10 +10,10 @@ camera keeps books of every exposure that did not show what was asked for. A com
 from __future__ import annotations
 
 import os
-import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
+from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -28,17 +28,15 @@ from scanner.methods.gupta_nayar import nearest_code
 from scanner.patterns import Plan
 from sim_backend.clock import VirtualClock
 from sim_backend.devices import SimulatedCamera, SimulatedProjector
+from sim_backend.faults import WrongExposure
 from sim_backend.settings import CameraSettings, FaultRates, FaultSettings, ProjectorSettings
 
 SHAPE = (48, 64)
 PROJECTOR = (320, 200)
-BY_DEVICE, BY_IMAGES, HARMLESS, UNDETECTED, IN_PREFLIGHT = (
-    "by device",
-    "by images",
-    "harmless",
-    "undetected",
-    "preflight",
-)
+BY_DEVICE, BY_IMAGES, HARMLESS, IN_PREFLIGHT, GIVEN_UP, UNDETECTED = COLUMNS = (
+    "by device", "by images", "harmless", "preflight", "in a scan given up", "undetected",
+)  # fmt: skip
+FULL = 2000
 
 RATES = {
     "stale": 0.002, "torn": 0.002, "mixed": 0.002, "cut": 0.001, "dark_flash": 0.002, "flicker": 0.002,
@@ -141,22 +139,21 @@ class Tally:
         self.undetected += other.undetected
 
     def table(self) -> str:
-        columns = (BY_DEVICE, BY_IMAGES, HARMLESS, IN_PREFLIGHT, UNDETECTED)
-        lines = ["| fault | injected | " + " | ".join(columns) + " |", "|---|---|" + "---|" * len(columns)]
+        lines = ["| fault | wrong frames | " + " | ".join(COLUMNS) + " |", "|---|" + "---|" * (1 + len(COLUMNS))]
         for kind in sorted({kind for kind, _ in self.found}):
-            counts = [self.found[kind, column] for column in columns]
+            counts = [self.found[kind, column] for column in COLUMNS]
             lines.append(f"| {kind} | {sum(counts)} | " + " | ".join(map(str, counts)) + " |")
         ends = ", ".join(f"{count} {end}" for end, count in sorted(self.scans.items()))
         lines.append(
-            f"{sum(self.scans.values())} scans ({ends}), {self.sequences} sequences committed, {self.repeated} repeated, "
-            f"{self.frames} frames; {len(self.false_alarms)} false alarms, {len(self.undetected)} undetected"
+            f"{sum(self.scans.values())} scans ({ends}), {self.sequences} sequences committed, "
+            f"{self.repeated} repeated, {self.frames} frames; {len(self.false_alarms)} false alarms, {len(self.undetected)} undetected"
         )
         return "\n".join(lines)
 
 
 def scan(method: str, steps: int, seed: int, rates: dict[str, float], tally: Tally) -> None:
     """One scan, and what became of its faults."""
-    random = np.random.default_rng([seed, steps, len(method)])
+    random = np.random.default_rng(seed)
     # Three and four steps cannot be had with a projector that is far from linear: the phases themselves are wrong then.
     gamma = 1.0 if steps < 6 or method == "mps_gn" else float(random.choice([1.0, 1.0, random.uniform(0.8, 2.2)]))
     light = Formula(random, gamma)
@@ -184,46 +181,61 @@ def scan(method: str, steps: int, seed: int, rates: dict[str, float], tally: Tal
         except OperatorError as error:
             end = f"refused by {type(error).__name__}"
     tally.scans[end] += 1
-    judge(books, light, camera, tally, f"{method} N={steps} seed {seed} gamma {gamma:.2f}")
+    judge(books, light, camera, tally, end == "completed", f"{method} N={steps} seed {seed} gamma {gamma:.2f}")
 
 
-def judge(books: Books, light: Formula, camera: SimulatedCamera, tally: Tally, name: str) -> None:
+def judge(books: Books, light: Formula, camera: SimulatedCamera, tally: Tally, completed: bool, name: str) -> None:
     """Compare what was committed and what was refused with the camera's books."""
     wrong = {w.number: w for w in camera.wrong_exposures}
-    seen: set[int] = set()
-    # Levels that are wrong themselves contradict one good sequence, until a second agrees with it.
-    misled = bool(wrong.keys() - {number for exposures in books.attempts.values() for number in exposures})
+    preflight = wrong.keys() - {number for exposures in books.attempts.values() for number in exposures}
+    committed_wrong = False
+    refused = []
     for key, exposures in books.attempts.items():
-        seen.update(exposures)
         bad = [number for number in exposures if number in wrong]
         tally.frames += len(exposures)
         plan = books.plans[key[0]]
-        complete = len(exposures) == len(plan.sequences[key[1]].fringes)
         if key in books.committed:
             tally.sequences += 1
             verdict = HARMLESS
             if bad and (ratio := corruption(plan, key[1], light, camera, exposures, wrong)) > 1:
-                verdict = UNDETECTED
-                kinds = [str(f) for number in bad for f in wrong[number].faults]
-                tally.undetected.append(f"{name} round {key[0]} sequence {key[1]} {kinds}: {ratio:.1f} × the noise")
+                committed_wrong = True
+                verdict = UNDETECTED if completed else GIVEN_UP
+                if completed:
+                    kinds = [str(f) for number in bad for f in wrong[number].faults]
+                    tally.undetected.append(f"{name} round {key[0]} sequence {key[1]} {kinds}: {ratio:.1f} × the noise")
         else:
             tally.repeated += 1
+            complete = len(exposures) == len(plan.sequences[key[1]].fringes)
             verdict = BY_IMAGES if complete else BY_DEVICE
-            if complete and not bad and key in books.aborted and not misled:
-                tally.false_alarms.append(f"{name} {key}: {books.aborted[key]}")
+            if complete and not bad and key in books.aborted:
+                refused.append(f"{name} {key}: {books.aborted[key]}")
         for number in bad:
-            tally.found[" + ".join(wrong[number].faults) or "not settled", verdict] += 1
-    for number in wrong.keys() - seen:
-        tally.found[" + ".join(wrong[number].faults) or "not settled", IN_PREFLIGHT] += 1
+            tally.found[label(wrong[number]), verdict] += 1
+    # A good sequence is refused where it contradicts wrong levels, until another agrees with it; and where it
+    # contradicts a wrong one that was the first of its round, until the scan is given up.
+    if not preflight and not committed_wrong:
+        tally.false_alarms += refused
+    for number in preflight:
+        tally.found[label(wrong[number]), IN_PREFLIGHT] += 1
     for reason in books.aborted.values():
-        for words, kind in (("does not answer", "lost camera"), ("no frame within", "drop or late"),
-                            ("is incomplete", "incomplete"), ("not the next one", "id jump")):  # fmt: skip
-            if words in reason:
-                tally.found[kind, BY_DEVICE] += 1
+        for words, kind in DEVICE_ERRORS.items():
+            tally.found[kind, BY_DEVICE] += words in reason
+
+
+def label(exposure: WrongExposure) -> str:
+    return " + ".join(exposure.faults) or "not settled"
+
+
+DEVICE_ERRORS = {
+    "does not answer": "lost camera",
+    "no frame within": "drop or late",
+    "is incomplete": "incomplete",
+    "not the next one": "id jump",
+}
 
 
 def corruption(plan, sequence, light, camera, exposures, wrong) -> float:
-    """How far the errors move the coordinates, in units of their noise, rms over the picture or an eighth of its rows."""
+    """How far the errors move the coordinates, in units of their noise: rms over all, or over an eighth of the rows."""
     fringes = plan.sequences[sequence]
     right = np.stack([light.grey([(1.0, p)]) for p in plan.render(sequence)])
     error = np.stack([wrong[e].error_dn if e in wrong else np.zeros(SHAPE, np.float32) for e in exposures])
@@ -233,9 +245,9 @@ def corruption(plan, sequence, light, camera, exposures, wrong) -> float:
         true, _, sigma_z = nearest_code(right, fringes, extent, NoiseModel(sigma))
         found, _, _ = nearest_code(right + error, fringes, extent, NoiseModel(sigma))
         kept = (true.lead > 7) & (found.lead > 7) & (true.amplitude > 8 * sigma_z)
-        moved = (np.abs(found.u - true.u) / true.sigma)[kept]
-        # One order too far is many times the noise: a hundredth of such pixels is what noise alone makes.
-        return float(np.quantile(moved, 0.99)) if moved.size else 0.0
+        # One order too far counts as ten times the noise: in a hundredth of the pixels it is as bad as noise in all.
+        moved = np.minimum(np.abs(found.u - true.u) / true.sigma, 10)[kept]
+        return float(np.sqrt(np.square(moved).mean())) if moved.size else 0.0
     steps = fringes.steps_rad
     solve = np.linalg.pinv(np.stack([np.ones_like(steps), np.cos(steps), -np.sin(steps)], axis=1))
     z = np.tensordot(solve[1] + 1j * solve[2], right, 1)
@@ -250,22 +262,47 @@ def corruption(plan, sequence, light, camera, exposures, wrong) -> float:
 
 
 CASES = [("mfs", 12), ("mfs", 12), ("mfs", 6), ("mfs", 4), ("tps", 12), ("mps", 12), ("mps_gn", 12), ("mfs", 3)]
+"""Methods and steps that take turns; MFS with twelve steps is what the scanner is for."""
 
 
-def soak(cases, seeds, rates) -> Tally:
+def soak(seeds: range) -> Tally:
+    """As many scans as seeds."""
     tally = Tally()
     for seed in seeds:
-        for method, steps in cases:
-            scan(method, steps, seed, rates, tally)
+        method, steps = CASES[seed % len(CASES)]
+        scan(method, steps, seed, RATES, tally)
     return tally
 
 
-def _share(part: int, cases: list[tuple[str, int]], seeds: range, rates: dict[str, float]) -> Tally:
-    return soak(cases, seeds, rates)
+def check(tally: Tally) -> None:
+    print(f"\n{tally.table()}", *tally.undetected, *tally.false_alarms, sep="\n")
+    assert not tally.undetected
+    assert not tally.false_alarms
+    assert tally.found.total() > sum(tally.scans.values())
 
 
-def test_no_wrong_frame_gets_in_and_no_good_one_is_refused():
-    tally = soak(CASES, range(3), RATES)
-    print(tally.table())
-    assert not tally.undetected, tally.undetected
-    assert not tally.false_alarms, tally.false_alarms
+def test_no_wrong_frame_gets_into_a_result_and_no_good_one_is_refused():
+    check(soak(range(3 * len(CASES))))
+
+
+@pytest.mark.bench
+def test_two_thousand_scans():
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    part = 50
+    tally = Tally()
+    with ProcessPoolExecutor(cores, mp_context=get_context("spawn")) as workers:
+        for done in workers.map(soak, [range(first, first + part) for first in range(0, FULL, part)]):
+            tally.add(done)
+    assert sum(tally.scans.values()) == FULL
+    check(tally)
+
+
+def test_the_books_know_a_wrong_frame_that_the_check_is_kept_from_seeing(monkeypatch):
+    # Without the check the same faults get in, and the books say so: what is proven above is not empty.
+    import scanner.acquisition
+    from scanner.integrity import SequenceCheck
+
+    monkeypatch.setattr(scanner.acquisition, "check_sequence", lambda *args: SequenceCheck((), np.zeros(0), 1.0))
+    tally = Tally()
+    scan("mfs", 12, 0, RATES, tally)
+    assert tally.undetected

@@ -13,7 +13,8 @@ from scanner.integrity.codes import wrong_codes
 from scanner.integrity.findings import SEQUENCE, Finding, SequenceCheck
 from scanner.integrity.history import SequenceHistory
 from scanner.integrity.naming import culprits
-from scanner.integrity.sampling import Grid, grid
+from scanner.integrity.sampling import Grid, grid, unsaturated
+from scanner.integrity.steps import wrong_steps
 from scanner.integrity.waveform import (
     FEWEST,
     Reference,
@@ -21,6 +22,7 @@ from scanner.integrity.waveform import (
     excess,
     fit,
     free_harmonics,
+    harmonic_excess,
     of_own_fringe,
     other_mean,
 )
@@ -30,7 +32,7 @@ _OWN_REDUNDANCY = 8
 """Steps from which the frames of a sequence tell every error of a single one by themselves."""
 
 
-_FEW_STEPS_ERROR = 0.4
+_FEW_STEPS_ERROR = 0.6
 """Of four or five steps that nothing else is known of: an error that is believed, in units of B."""
 
 
@@ -73,23 +75,31 @@ def check_sequence(
     ]
     cells = grid(frames.shape[1:])
     values = cells.take_all(frames)
-    valid = np.asarray((values < saturated_dn).all(axis=0))
+    valid = unsaturated(values, saturated_dn)
     stepped = sum(f.frequency == fringes.fringes[0].frequency for f in fringes.fringes)
     steps = fringes.steps_rad[:stepped]
-    reference = history.reference(values[:stepped], valid) if history and stepped < _OWN_REDUNDANCY else None
-    waveform = fit(values[:stepped], valid, steps, reference)
+    reference = None
+    if history and stepped < _OWN_REDUNDANCY:
+        reference = history.reference(values[:stepped], valid)
+    waveform = fit(values[:stepped], valid, steps, reference, history.noise_dn if history else np.inf)
     found = np.full(count, np.nan)
+    if not findings and reference is None and 3 < stepped < 6 and np.count_nonzero(valid) >= FEWEST:
+        findings += wrong_steps(values[:stepped, valid], steps)
     if np.count_nonzero(waveform.usable) >= FEWEST:
         if not findings:
-            findings += _errors(values[:stepped], steps, waveform, reference, cells, found)
+            findings += _errors(
+                values[:stepped], steps, waveform, reference, cells, found, bool(history and history.linear)
+            )
+            if history and reference and findings and history.doubt_levels(waveform, valid, cells, stepped):
+                findings = []
         if history and not findings:
-            findings += _among_others(values, fringes, waveform, history, cells)
-    elif history and not findings and (lost := history.lost_light(waveform)):
+            findings += _among_others(values, valid, fringes, waveform, history, cells)
+    elif history and not findings and (lost := history.lost_light(values[:stepped], waveform, valid)):
         findings.append(Finding(SEQUENCE, lost))
     if history:
         if findings and history.begins_with_the_former(values[0], waveform):
             findings.insert(0, Finding(0, "frame 1 is still the last picture of the sequence before"))
-        history.exposed(values[-1])
+        history.ended(values[-1], not findings)
         if not findings:
             history.accept(fringes, waveform, valid)
     blind = "" if stepped >= 6 or reference else _blind_to(stepped)
@@ -103,11 +113,14 @@ def _errors(
     reference: Reference | None,
     cells: Grid,
     found: NDArray[np.float64],
+    linear: bool,
 ) -> list[Finding]:
     """Errors of single frames; ``found`` takes the steps that the frames had."""
     found[: len(steps)] = steps
     if free_harmonics(len(steps)) > 1:
         beyond = excess(waveform, cells)
+        if linear:
+            beyond = np.concatenate([beyond, harmonic_excess(waveform, cells)])
         if beyond.max() > 1:
             return _named(values, steps, waveform, beyond, cells, found)
     elif len(steps) > 3 and reference is None:
@@ -151,13 +164,19 @@ def _named(
 
 
 def _among_others(
-    values: NDArray[np.float32], fringes: FringeSequence, waveform: Waveform, history: SequenceHistory, cells: Grid
+    values: NDArray[np.float32],
+    valid: NDArray[np.bool_],
+    fringes: FringeSequence,
+    waveform: Waveform,
+    history: SequenceHistory,
+    cells: Grid,
 ) -> list[Finding]:
     """What only the sequences before, or the code of several frequencies, can tell."""
     few = fringes.frequency is None or len(fringes.fringes) < 6
     if few and history.begins_with_the_former(values[0], waveform):
         return [Finding(0, "frame 1 is still the last picture of the sequence before")]
-    told = [history.lost_light(waveform)]
+    stepped = values[: np.count_nonzero([f.frequency == fringes.fringes[0].frequency for f in fringes.fringes])]
+    told = [history.lost_light(stepped, waveform, valid)]
     extent = history.extent(fringes.axis)
     if fringes.frequency is not None:
         told += [history.shown_before(fringes, waveform), history.elsewhere(fringes, waveform)]

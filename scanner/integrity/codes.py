@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,8 +12,11 @@ from scanner.integrity.findings import Finding
 from scanner.integrity.sampling import Grid
 from scanner.integrity.waveform import FEWEST, Waveform
 from scanner.patterns import FringeSequence
+from scanner.unwrapping import Coordinates
 
-_MISFIT, _FITS = 8.0, 3.0
+_WHOLE, _PART = (1.6, 1.2, 1.5), (5.0, 1.5, 5.0)
+_STEPS = 3
+_SAME_PICTURE, _OTHER_PICTURE = 1.5, 4.0
 _ASKED = 2_000
 _FEWEST_OF_BAND = 40
 
@@ -41,22 +46,22 @@ def wrong_codes(
 
     def misfits(left_out: int | None) -> list[float]:
         kept = [n for n in range(count) if n != left_out]
-        found = _misfit(
-            values[kept][:, pixels],
-            FringeSequence(fringes.axis, tuple(fringes.fringes[n] for n in kept)),
-            extent,
-            waveform.sigma_dn,
-        )
+        c = _decoded(values, fringes, kept, extent, waveform.sigma_dn, pixels)
+        found = c.chi2[0] / c.dof
         return [float(np.median(found[np.isin(pixels, band)])) for band in bands]
 
+    if again := _shown_again(values, fringes, extent, waveform, pixels):
+        return again
     together = misfits(None)
-    if max(together) < _MISFIT:
+    # In a part of the picture many pixels may see two paths of light, which fit no code either.
+    limits = [_WHOLE] + [_PART] * (len(bands) - 1)
+    if all(whole < misfit for whole, (misfit, _, _) in zip(together, limits, strict=True)):
         return []
     first_single = next(n for n, f in enumerate(fringes.fringes) if f.frequency != fringes.fringes[0].frequency)
     found = []
     for n in range(first_single, count):
-        for band, whole, without in zip(bands, together, misfits(n), strict=True):
-            if whole > _MISFIT and without < _FITS and whole > 8 * without:
+        for band, whole, without, (misfit, fits, better) in zip(bands, together, misfits(n), limits, strict=True):
+            if whole > misfit and without < fits and whole > better * without:
                 rows = cells.rows_px[band]
                 where = "" if band is pixels else f" in rows {int(rows.min()) + 1} to {int(rows.max()) + 1}"
                 found.append(
@@ -66,8 +71,37 @@ def wrong_codes(
     return found
 
 
-def _misfit(values: NDArray[np.float32], fringes: FringeSequence, extent: int, sigma_dn: float) -> NDArray[np.float32]:
+def _shown_again(
+    values: NDArray[np.float32], fringes: FringeSequence, extent: int, waveform: Waveform, pixels: NDArray[np.intp]
+) -> list[Finding]:
+    """Frames that are the one before them but for the noise, where the patterns should have differed."""
+    found = []
+    noise = np.sqrt(2) * waveform.sigma_dn
+    for n in range(1, len(fringes.fringes)):
+        seen = np.sqrt(np.square(values[n, pixels] - values[n - 1, pixels]).mean())
+        if seen > _SAME_PICTURE * noise:
+            continue
+        # Where the pixels lie, the others tell: two frequencies may be alike over all of a small object.
+        kept = [k for k in range(len(fringes.fringes)) if k < _STEPS or k not in (n - 1, n)]
+        c = _decoded(values, fringes, kept, extent, waveform.sigma_dn, pixels)
+        now, before = (
+            np.cos(2 * np.pi * f.frequency * c.u[0] + f.step_rad) for f in (fringes.fringes[n], fringes.fringes[n - 1])
+        )
+        if np.sqrt(np.square(c.amplitude[0] * (now - before)).mean()) > _OTHER_PICTURE * noise:
+            found.append(Finding(n, f"frame {n + 1} shows the pattern of frame {n} again: a stale frame"))
+    return found
+
+
+def _decoded(
+    values: NDArray[np.float32],
+    fringes: FringeSequence,
+    kept: list[int],
+    extent: int,
+    sigma_dn: float,
+    pixels: NDArray[np.intp],
+) -> Coordinates:
     from scanner.methods.gupta_nayar import nearest_code
 
-    c, _, _ = nearest_code(values[:, None], fringes, extent, NoiseModel(sigma_dn))  # type: ignore[arg-type]
-    return np.asarray((c.chi2 / np.float32(c.dof))[0])
+    part = FringeSequence(fringes.axis, tuple(fringes.fringes[n] for n in kept))
+    frames: Any = values[kept][:, None, pixels]
+    return nearest_code(frames, part, extent, NoiseModel(sigma_dn))[0]

@@ -14,19 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import Pixels
-from scanner.integrity.sampling import gradients, grid
-from scanner.integrity.waveform import FEWEST, Reference, Waveform
+from scanner.integrity.sampling import Grid, gradients, grid
+from scanner.integrity.waveform import FEWEST, Reference, Waveform, other_mean
 from scanner.patterns import Axis, FringeSequence
 
 _LOST = 0.2
-_STRONG = 4.0
+_STRONG = 0.4
+_UNCLIPPED = 0.97
 _SAME_PICTURE = 1.5
 _DIVERSE = 0.5
 _SAME_PHASES = 1.5
 _CONVINCED = 50.0
 _AGREED, _DISAGREED = 0.6, 0.2
-_ASKED = 256
-_UNWRAP_FROM = 3
+_ASKED = 128
+_UNWRAP_FROM = 2
 
 
 @dataclass
@@ -43,18 +44,33 @@ class _Shown:
 class SequenceHistory:
     """The memory of one scan: make one for it, `begin_round` with each round, and give it to every `check_sequence`.
 
+    Attributes
+    ----------
+    linear
+        Whether the projector has been found to respond linearly, and never otherwise.
+    noise_dn
+        Of a grey value in the sequences so far, DN; infinite before the first.
+
+    Notes
+    -----
     It is not safe to share among threads, and sequences must be checked in the order in which they were exposed.
     """
 
     _round: int = 0
+    _noises: list[float] = field(default_factory=list)
     _shown: list[_Shown] = field(default_factory=list)
     _last: NDArray[np.float32] | None = None
     _mean: NDArray[np.float32] | None = None
     _means: int = 0
+    _modulation: NDArray[np.float32] | None = None
     _lit: NDArray[np.bool_] | None = None
+    linear: bool = False
+    _distorts: bool = False
+    noise_dn: float = float("inf")
     _extent: dict[Axis, int] = field(default_factory=dict)
     _known: dict[Axis, NDArray[np.float32]] = field(default_factory=dict)
     _levels: NDArray[np.float32] | None = None
+    _contradicting: list[tuple[NDArray[np.float32], NDArray[np.bool_]]] = field(default_factory=list)
     _unclipped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
     _frames: int = 0
 
@@ -85,12 +101,13 @@ class SequenceHistory:
         """
         self._round += 1
         self._extent = {"x": size[0], "y": size[1]}
-        self._mean, self._means, self._lit, self._levels = None, 0, None, None
-        self._known = {}
+        self._mean = self._modulation = self._lit = self._levels = None
+        self._means, self._known, self._contradicting = 0, {}, []
         if levels is not None:
             cells = grid(levels[0].shape)
             self._levels = cells.take_all(np.stack(levels))
-            self._unclipped = self._levels[0] < saturated_dn
+            # Not up to the last grey value: of pixels about there, the noise would choose the dark ones.
+            self._unclipped = self._levels[0] < _UNCLIPPED * saturated_dn
         for axis, u in zip(("x", "y"), coordinates, strict=True):
             if u is not None:
                 self._known[axis] = grid(u.shape).take(u)  # type: ignore[index]
@@ -105,9 +122,9 @@ class SequenceHistory:
         """Projector pixels along ``axis``, where a round was begun."""
         return self._extent.get(axis)
 
-    def exposed(self, last: NDArray[np.float32]) -> None:
-        """The last frame of a sequence, good or bad, at the sampled pixels."""
-        self._last = last
+    def ended(self, last: NDArray[np.float32], good: bool) -> None:
+        """Take over the last frame of a sequence at the sampled pixels; of a bad one nobody knows what it shows."""
+        self._last = last if good else None
 
     def accept(self, fringes: FringeSequence, waveform: Waveform, valid: NDArray[np.bool_]) -> None:
         """Take over a sequence that was found good."""
@@ -118,8 +135,12 @@ class SequenceHistory:
             # The last few weigh most: light drifts.
             self._means = min(self._means + 1, 8)
             self._mean = self._mean + (mean - self._mean) / np.float32(self._means)
-        strong = waveform.usable & (np.abs(waveform.z) > _STRONG * waveform.clear_dn)
-        self._lit = strong if self._lit is None else self._lit & strong
+        self._noises.append(waveform.sigma_dn)
+        self.noise_dn = float(np.median(self._noises))
+        found = waveform.linear()
+        # Once found not to be linear, it never is: where bounces blur the fringes, they blur the harmonics out first.
+        self.linear, self._distorts = (found or self.linear) and not self._distorts, found is False or self._distorts
+        self._modulation = np.where(waveform.usable, np.abs(waveform.z), np.float32(0))
         if fringes.frequency is not None:
             sigma_z = waveform.sigma_dn * float(np.sqrt(2 / len(fringes.fringes)))
             shown = _Shown(fringes.axis, fringes.frequency, waveform.z, sigma_z, waveform.usable, self._round)
@@ -127,6 +148,17 @@ class SequenceHistory:
                 s for s in self._shown if (s.axis, s.frequency, s.round) != (shown.axis, shown.frequency, shown.round)
             ]
             self._shown.append(shown)
+
+    def doubt_levels(self, waveform: Waveform, valid: NDArray[np.bool_], cells: Grid, count: int) -> bool:
+        """Whether the levels, rather than a sequence that contradicts them, are wrong: one before agreed with it."""
+        if self._mean is not None or self._levels is None:
+            return False
+        agreed = any(
+            other_mean(waveform, Reference(mean, known, 1 / count), count, cells).max() <= 1
+            for mean, known in self._contradicting
+        )
+        self._contradicting.append((waveform.mean, valid & waveform.usable))
+        return agreed
 
     # What the sequences before say of a new one; each returns what is wrong, in words, or "".
 
@@ -142,7 +174,7 @@ class SequenceHistory:
         return bool(off < _SAME_PICTURE * np.sqrt(2) * waveform.sigma_dn)
 
     def reference(self, values: NDArray[np.float32], valid: NDArray[np.bool_]) -> Reference | None:
-        """The mean A of the steps whose (N, P) ``values`` are given, as the pictures before them have it."""
+        """The mean A of the steps whose (N, P) ``values`` are given, as the sequences before them have it."""
         if self._mean is not None:
             known = np.isfinite(self._mean)
             return Reference(np.where(known, self._mean, np.float32(0)), known, 1 / (self._frames * self._means))
@@ -154,22 +186,33 @@ class SequenceHistory:
         if np.count_nonzero(strong) < FEWEST:
             return None
         share = np.median((values.mean(axis=0)[strong] - dark[strong]) / contrast[strong])
+        # No waveform has its mean at an end of its range: a projector that stays dark must not look like one.
+        share = np.clip(share, 0.15, 0.85)
         return Reference(dark + share * contrast, valid & self._unclipped, float(share**2 + (1 - share) ** 2))
 
-    def lost_light(self, waveform: Waveform) -> str:
-        """Compare the pixels with fringes with those that had them before."""
-        expected = self._lit
+    def lost_light(self, values: NDArray[np.float32], waveform: Waveform, valid: NDArray[np.bool_]) -> str:
+        """Whether the fringes are gone from where they must be, and the mean of the (N, P) frames is another as well.
+
+        The modulation alone does not tell: where two paths of light meet, it may vanish at one frequency.
+        """
+        expected, reference = self._modulation, self.reference(values, valid)
         if expected is None and self._levels is not None:
-            contrast = self._levels[0] - self._levels[1]
-            expected = contrast > 2 * _STRONG * waveform.clear_dn
-        if expected is None or np.count_nonzero(expected) < FEWEST:
+            expected = (self._levels[0] - self._levels[1]) / 2
+        if expected is not None and reference is not None:
+            strong = reference.known & valid & (expected > _STRONG * float(np.quantile(expected, 0.995)))
+            lost = ~waveform.usable | (np.abs(waveform.z) < _LOST * expected)
+            off = np.square(waveform.mean - reference.mean)
+        elif self._lit is not None:
+            strong, lost, off = self._lit, ~waveform.usable, None
+        else:
             return ""
-        share = float(waveform.usable[expected].mean())
-        if share >= _LOST:
+        if np.count_nonzero(strong) < FEWEST or lost[strong].mean() < 1 - _LOST:
+            return ""
+        if expected is not None and off is not None and off[strong].mean() < np.square(_LOST * expected[strong]).mean():
             return ""
         return (
-            f"only {100 * share:.0f} % of the pixels that must show fringes do: the picture stood still, was dark, or "
-            "belongs to another sequence"
+            f"{100 * lost[strong].mean():.0f} % of the pixels that must show fringes do not: the picture stood still, "
+            "was dark, or belongs to another sequence"
         )
 
     def shown_before(self, fringes: FringeSequence, waveform: Waveform) -> str:
@@ -256,7 +299,7 @@ class SequenceHistory:
         ]
         if len(former) < _UNWRAP_FROM:
             return ""
-        # Heavy, and not needed before the fourth frequency of an axis.
+        # Heavy, and not needed before the third frequency of an axis.
         from scipy.stats import chi2
 
         from scanner.phasors import AxisPhasors
@@ -279,8 +322,8 @@ class SequenceHistory:
         if agreeing(len(frequencies)) > _DISAGREED or agreeing(len(former)) < _AGREED:
             return ""
         return (
-            f"the phases fit no coordinate together with those of {len(former)} other sequences of axis {fringes.axis}: "
-            "pictures of another sequence, or in another order"
+            f"the phases fit no coordinate together with those of {len(former)} other sequences of axis "
+            f"{fringes.axis}: pictures of another sequence, or in another order"
         )
 
 

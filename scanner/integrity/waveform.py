@@ -25,22 +25,28 @@ STEADY = 0.005
 ROUNDING_DN = 0.29
 """Standard deviation of a rounded grey value."""
 
-LAMP = 0.01
+LAMP = 0.003
 """The light may have become so much brighter or darker between two sequences."""
 
 FEWEST = 60
 """Pixels with fringes below which nothing can be said."""
 
 _CLEAR = 6.0
+_MORE_NOISE = 1.25
 _FEWEST_OF_TILE = 40
-_SIGNIFICANT = 10.0
-_UNCERTAIN_NOISE = 0.3
+_SIGNIFICANT = 6.5
+_UNCERTAIN_NOISE = 0.4
 _LEAST_VISIBLE = 0.05
+_LINEAR = 0.03
+_DRIFT = 0.002
 _WELL_CONDITIONED = 100.0
 
-_NEXT_HARMONIC = {2: (0.7, 0.05), 3: (0.3, 0.02), 4: (0.15, 0.01)}
+_NEXT_HARMONIC = {2: (1.4, 0.07), 3: (0.4, 0.025), 4: (0.2, 0.012)}
 """Of the first harmonic beyond K: its greatest share of c₂ and of A. A power law I ~ L^γ, γ = 0.8..2.2, has half that:
 c₂/c₁ = (γ - 1)/(γ + 2), c_{k+1}/c_k = (γ - k)/(γ + k + 1). The other half is for pixels that see two paths."""
+
+_ALIAS = {3: 0.035, 4: 0.013, 5: 0.008, 6: 0.005, 7: 0.004}
+"""Greatest plausible Nth harmonic of the waveform, as a share of B: the mean of N steps holds it."""
 
 
 def free_harmonics(count: int) -> int:
@@ -87,8 +93,8 @@ class Waveform:
         Modulation from which a pixel is usable, DN.
     sigma_dn
         Noise of one grey value, DN.
-    second
-        Share of the second harmonic in the modulation, rms over the pixels; 0 where it was not measured.
+    harmonics
+        (K - 1, U) phasors of the harmonics 2..K at the usable pixels, DN; empty where they are not free.
     errors
         (N, U) what each frame would have to be wrong by, alone, at the usable pixels, DN; empty for three steps.
     visible
@@ -100,7 +106,7 @@ class Waveform:
     usable: NDArray[np.bool_]
     clear_dn: float
     sigma_dn: float
-    second: float
+    harmonics: NDArray[np.complex64]
     errors: NDArray[np.float32]
     visible: NDArray[np.float64]
 
@@ -109,12 +115,28 @@ class Waveform:
         """Share of the pixels that are usable."""
         return float(self.usable.mean())
 
+    def distortion(self) -> NDArray[np.complex64]:
+        """(K - 1,) c₂..c_K as shares of c₁, of what goes with the phase as a projector's response makes it."""
+        b = np.maximum(np.abs(self.z[self.usable]), 1e-6)
+        turn = self.z[self.usable].conj() / b
+        along = [(h * turn ** (k + 2) * b).sum() for k, h in enumerate(self.harmonics)]
+        return np.asarray(np.array(along) / np.square(b).sum(), np.complex64)
+
+    def linear(self) -> bool | None:
+        """Whether no second harmonic is found, of whatever phase, that noise does not explain; None where unknown."""
+        if not self.harmonics.size:
+            return None
+        noise = 4 * self.sigma_dn**2 / len(self.visible)
+        power = float(np.square(np.abs(self.harmonics[0])).mean()) - noise
+        return bool(power < (_LINEAR * float(np.abs(self.z[self.usable]).mean())) ** 2)
+
 
 def fit(
     values: NDArray[np.float32],
     valid: NDArray[np.bool_],
     steps_rad: NDArray[np.float64],
     reference: Reference | None = None,
+    former_noise_dn: float = np.inf,
 ) -> Waveform:
     """Least squares of the waveform with the given steps.
 
@@ -128,6 +150,8 @@ def fit(
         (N,) planned steps.
     reference
         The mean as other sequences have it; with few steps the noise is measured against it.
+    former_noise_dn
+        Noise of a grey value in the sequences before: an error that passes for noise must not hide itself.
     """
     count = len(steps_rad)
     orders = free_harmonics(count)
@@ -147,21 +171,23 @@ def fit(
         sigma = noise_of(against, valid & reference.known, lit, 0.0) / reference.noise_gain(count)
         sigma = max(sigma, ROUNDING_DN)
     else:
-        # Three steps leave no residual. What changes from pixel to pixel within a frame is texture as well as noise.
-        sigma = noise_of(values, valid, lit, ROUNDING_DN)
+        # Three steps leave no residual. But the texture of an object changes mean and modulation alike.
+        contrast = float(np.median(modulation[lit] / np.maximum(mean[lit], 1))) if lit.any() else 0.0
+        sigma = noise_of((modulation - np.float32(contrast) * mean)[None], valid, lit, 0.0)
+        sigma = max(sigma / float(np.sqrt((2 + contrast**2) / count)), ROUNDING_DN)
+    sigma = min(sigma, _MORE_NOISE * former_noise_dn)
     clear = _CLEAR * sigma * float(np.linalg.norm(solve[1]))
     usable = valid & (modulation > clear)
     visible = np.square(unexplained, dtype=np.float64).sum(axis=1)
     errors = np.empty((count, 0), np.float32)
-    second = 0.0
     if len(rest) and usable.any():
         errors = (unexplained / np.maximum(visible, 1e-9)[:, None].astype(np.float32)) @ rest[:, usable]
+    harmonics = np.empty((0, int(usable.sum())), np.complex64)
     if orders > 1 and usable.any():
-        harmonic = solve[[2, 2 + orders]] @ values[:, usable]
-        floor = 2 * sigma**2 * float(np.square(solve[2]).sum())
-        power = float(np.square(modulation[usable]).mean())
-        second = float(np.sqrt(max(float(np.square(harmonic).sum(axis=0).mean()) - floor, 0.0) / power))
-    return Waveform(mean, z, usable, clear, sigma, second, errors, visible)
+        rows = np.concatenate([solve[2 : 1 + orders], solve[2 + orders :]])
+        both = rows @ values[:, usable]
+        harmonics = both[: orders - 1] + np.complex64(1j) * both[orders - 1 :]
+    return Waveform(mean, z, usable, clear, sigma, harmonics, errors, visible)
 
 
 def series(steps_rad: NDArray[np.float64], orders: int) -> NDArray[np.float64]:
@@ -172,22 +198,50 @@ def series(steps_rad: NDArray[np.float64], orders: int) -> NDArray[np.float64]:
 
 def excess(waveform: Waveform, cells: Grid) -> NDArray[np.float64]:
     """(N, tiles + 1) how far each frame's error is beyond what noise and harmonics make: above 1 is an alarm."""
-    count = len(waveform.visible)
-    b = np.abs(waveform.z[waveform.usable])
-    level = np.maximum(waveform.mean[waveform.usable], b)
-    share, most = _NEXT_HARMONIC[free_harmonics(count)]
+    share, most = _NEXT_HARMONIC[free_harmonics(len(waveform.visible))]
     visible = np.maximum(waveform.visible, 1e-9)[:, None]
-    moments = cells.sums(np.concatenate([np.square(waveform.errors), [b**2, level**2]]), waveform.usable)
-    pixels = np.maximum(_counted(cells, waveform.usable), 1)
-    harmonic = min(share * waveform.second, most) ** 2 / 2 * moments[-1] / pixels / visible**2
+    energy, single, brightness, pixels = _energies(np.square(waveform.errors), waveform, cells)
+    next_harmonic = min(share * float(np.abs(waveform.distortion()[0])), most)
     found = beyond(
-        energy=moments[:count] / pixels,
+        energy=energy,
         noise=waveform.sigma_dn**2 / visible,
-        let_pass=count / 2 * ((TOLERANCE * waveform.sigma_dn) ** 2 + STEADY**2 * moments[-2] / pixels) + harmonic,
+        let_pass=single + next_harmonic**2 / 2 * brightness / visible**2,
         pixels=pixels,
     )
     found[waveform.visible < _LEAST_VISIBLE] = 0
     return found
+
+
+def harmonic_excess(waveform: Waveform, cells: Grid) -> NDArray[np.float64]:
+    """(1, tiles + 1) how far the free harmonics are beyond what noise makes of them: above 1 is an alarm.
+
+    Of a linear projector they are errors as well, of several frames at once, as where the picture lags for a while.
+    """
+    count, shares = len(waveform.visible), waveform.distortion()
+    b = np.maximum(np.abs(waveform.z[waveform.usable]), 1e-6)
+    turn = waveform.z[waveform.usable] / b
+    free = [h - c * turn ** (k + 2) * b for k, (h, c) in enumerate(zip(waveform.harmonics, shares, strict=True))]
+    energy, single, brightness, pixels = _energies(np.square(np.abs(free)).sum(axis=0)[None], waveform, cells)
+    parts = 2 * len(free) * 2 / count
+    return beyond(
+        energy=energy,
+        noise=parts * waveform.sigma_dn**2,
+        let_pass=parts / count * single + float(np.square(3 * np.abs(shares)).sum()) * brightness,
+        pixels=pixels,
+    )
+
+
+def _energies(
+    squares: NDArray[np.float32], waveform: Waveform, cells: Grid
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Over the tiles: mean (K, U) ``squares``, the harmless error of one frame, the mean square of A, the pixels."""
+    b = np.abs(waveform.z[waveform.usable])
+    level = np.maximum(waveform.mean[waveform.usable], b)
+    moments = cells.sums(np.concatenate([squares, [b**2, level**2]]), waveform.usable)
+    pixels = np.maximum(_counted(cells, waveform.usable), 1)
+    moments /= pixels
+    single = len(waveform.visible) / 2 * ((TOLERANCE * waveform.sigma_dn) ** 2 + STEADY**2 * moments[-2])
+    return moments[:-2], single, moments[-1], pixels
 
 
 def of_own_fringe(waveform: Waveform) -> NDArray[np.float64]:
@@ -219,15 +273,25 @@ def other_mean(waveform: Waveform, reference: Reference, count: int, cells: Grid
     change = float(np.median(mean / np.maximum(former, 1)))
     off = mean - former * np.float32(np.clip(change, 1 - LAMP, 1 + LAMP))
     b = np.abs(z)
-    turned = (z / np.maximum(b, 1e-6)) ** count * b
-    shapes = np.stack([turned.real, turned.imag], axis=1)
-    harmonic = float(np.hypot(*np.linalg.lstsq(shapes, off, rcond=1e-3)[0]))
+    alias = _alias(z, off, count)
+    # In a part of the picture, bounces make more of it than over all.
+    allowed = np.full(cells.tiles + 1, 3 * max(alias, (0.25 if count == 3 else 0.1) * _ALIAS[count]))
+    allowed[-1] = 1.5 * max(alias, 0.1 * _ALIAS[count])
     moments = cells.sums(np.stack([off**2, b**2, np.maximum(mean, b) ** 2]), there)
     pixels = np.maximum(_counted(cells, there), 1)
     single = count / 2 * ((TOLERANCE * waveform.sigma_dn) ** 2 + STEADY**2 * moments[1] / pixels) / count**2
-    steady = (STEADY**2 + (3 * harmonic) ** 2 / 2) * moments[2] / pixels
+    steady = (_DRIFT**2 + allowed**2 / 2) * moments[2] / pixels
     noise = (waveform.sigma_dn * reference.noise_gain(count)) ** 2
     return beyond(moments[0] / pixels, noise, single + steady, pixels)
+
+
+def _alias(z: NDArray[np.complex64], off: NDArray[np.float32], count: int) -> float:
+    """Amplitude of what goes with the Nth multiple of the phase in (U,) ``off``, as a share of B, if plausible."""
+    b = np.abs(z)
+    turn = z / np.maximum(b, 1e-6)
+    # What goes with the phase itself is an error; it is fitted as well, lest a part of it should pass for a harmonic.
+    shapes = np.stack([b] + [b * part for k in (1, count) for part in ((turn**k).real, (turn**k).imag)], axis=1)
+    return min(float(np.hypot(*np.linalg.lstsq(shapes, off, rcond=1e-3)[0][3:])), _ALIAS[count])
 
 
 def beyond(
