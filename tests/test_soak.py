@@ -145,8 +145,8 @@ class Tally:
             lines.append(f"| {kind} | {sum(counts)} | " + " | ".join(map(str, counts)) + " |")
         ends = ", ".join(f"{count} {end}" for end, count in sorted(self.scans.items()))
         lines.append(
-            f"{sum(self.scans.values())} scans ({ends}), {self.sequences} sequences committed, "
-            f"{self.repeated} repeated, {self.frames} frames; {len(self.false_alarms)} false alarms, {len(self.undetected)} undetected"
+            f"{sum(self.scans.values())} scans ({ends}), {self.sequences} sequences committed, {self.repeated} "
+            f"repeated, {self.frames} frames; {len(self.false_alarms)} false alarms, {len(self.undetected)} undetected"
         )
         return "\n".join(lines)
 
