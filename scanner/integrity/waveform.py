@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from scanner.integrity.sampling import Grid, noise_of
 
-TOLERANCE = 0.7
-"""Errors that change a coordinate by half of its noise, rms, are the largest that are let pass: an error e of one frame
-of N changes a phase by (2/N) (e/B) sin φ, the noise by √(2/N) σ/B, and e = 0.7 σ √(N/2) makes the ratio 1/2."""
+TOLERANCE = 0.6
+"""Errors that change a coordinate by less than half of its noise, rms, are let pass: an error e of one frame of N
+changes a phase by (2/N) (e/B) sin φ, the noise by √(2/N) σ/B, and e = 0.6 σ √(N/2) makes the ratio 0.4."""
 
 STEADY = 0.005
 """No lamp is steadier than this: errors below it, as a share of B for each of N/2 frames, are no reason for alarm."""
@@ -35,13 +35,13 @@ _CLEAR = 6.0
 _MORE_NOISE = 1.25
 _FEWEST_OF_TILE = 40
 _SIGNIFICANT = 6.5
-_UNCERTAIN_NOISE = 0.4
+_UNCERTAIN_NOISE = 0.3
 _LEAST_VISIBLE = 0.05
 _LINEAR = 0.03
 _DRIFT = 0.002
 _WELL_CONDITIONED = 100.0
 
-_NEXT_HARMONIC = {2: (1.4, 0.07), 3: (0.4, 0.025), 4: (0.2, 0.012)}
+_NEXT_HARMONIC = {2: (1.4, 0.07), 3: (0.5, 0.03), 4: (0.25, 0.015)}
 """Of the first harmonic beyond K: its greatest share of c₂ and of A. A power law I ~ L^γ, γ = 0.8..2.2, has half that:
 c₂/c₁ = (γ - 1)/(γ + 2), c_{k+1}/c_k = (γ - k)/(γ + k + 1). The other half is for pixels that see two paths."""
 
@@ -123,12 +123,15 @@ class Waveform:
         return np.asarray(np.array(along) / np.square(b).sum(), np.complex64)
 
     def linear(self) -> bool | None:
-        """Whether no second harmonic is found, of whatever phase, that noise does not explain; None where unknown."""
+        """Whether the projector's response is linear, as the second harmonic has it; None where noise leaves it open."""
         if not self.harmonics.size:
             return None
         noise = 4 * self.sigma_dn**2 / len(self.visible)
-        power = float(np.square(np.abs(self.harmonics[0])).mean()) - noise
-        return bool(power < (_LINEAR * float(np.abs(self.z[self.usable]).mean())) ** 2)
+        power = float(np.square(np.abs(self.harmonics[0])).mean())
+        limit = (_LINEAR * float(np.abs(self.z[self.usable]).mean())) ** 2
+        if power - (1 - _UNCERTAIN_NOISE) * noise < limit:
+            return True
+        return False if power - (1 + _UNCERTAIN_NOISE) * noise > limit else None
 
 
 def fit(
@@ -276,7 +279,7 @@ def other_mean(waveform: Waveform, reference: Reference, count: int, cells: Grid
     alias = _alias(z, off, count)
     # In a part of the picture, bounces make more of it than over all.
     allowed = np.full(cells.tiles + 1, 3 * max(alias, (0.25 if count == 3 else 0.1) * _ALIAS[count]))
-    allowed[-1] = 1.5 * max(alias, 0.1 * _ALIAS[count])
+    allowed[-1] = 2.2 * max(alias, 0.1 * _ALIAS[count])
     moments = cells.sums(np.stack([off**2, b**2, np.maximum(mean, b) ** 2]), there)
     pixels = np.maximum(_counted(cells, there), 1)
     single = count / 2 * ((TOLERANCE * waveform.sigma_dn) ** 2 + STEADY**2 * moments[1] / pixels) / count**2
@@ -313,8 +316,10 @@ def beyond(
     pixels
         (tiles + 1,) over how many pixels it was taken.
     """
-    harmful = (energy - noise) / (1.5 * let_pass + _UNCERTAIN_NOISE * noise)
-    significant = (energy / noise - 1) * np.sqrt(pixels / 2) / _SIGNIFICANT
+    harmful = (energy - noise) / (let_pass + _UNCERTAIN_NOISE * noise)
+    # The cube root of χ² is normal but for little (Wilson & Hilferty, PNAS 17, 684 (1931)).
+    spread = 2 / (9 * pixels)
+    significant = (np.cbrt(energy / noise) - (1 - spread)) / np.sqrt(spread) / _SIGNIFICANT
     found = np.minimum(harmful, significant)
     found[..., pixels < _FEWEST_OF_TILE] = 0
     return np.asarray(found)
