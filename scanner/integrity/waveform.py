@@ -123,7 +123,7 @@ class Waveform:
         return np.asarray(np.array(along) / np.square(b).sum(), np.complex64)
 
     def linear(self) -> bool | None:
-        """Whether the projector's response is linear, as the second harmonic has it; None where noise leaves it open."""
+        """Whether the projector responds linearly, as the second harmonic has it; None where noise leaves it open."""
         if not self.harmonics.size:
             return None
         noise = 4 * self.sigma_dn**2 / len(self.visible)
