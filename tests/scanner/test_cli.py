@@ -236,7 +236,8 @@ def test_sigkill_leaves_a_take_that_opens(run, bench_file, tmp_path, delay):
     if enough:
         assert done.returncode in (0, 4), done.stderr
     else:
-        assert done.returncode in (2, 4), done.stderr
+        # From about three frequencies on, the fewer are decoded as well; whether that passes the gates, they decide.
+        assert done.returncode in (0, 2, 4), done.stderr
         assert "Traceback" not in done.stderr
     shutil.rmtree(partial)
 
