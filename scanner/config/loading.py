@@ -69,10 +69,16 @@ class LoadedConfig:
         from ruamel.yaml.representer import RoundTripRepresenter
 
         class Representer(RoundTripRepresenter):
-            """Writes null as a word, where the default is nothing at all."""
+            """Writes null as a word, and quotes texts with line breaks of any kind so that they come back."""
 
         Representer.add_representer(
             type(None), lambda representer, _: representer.represent_scalar("tag:yaml.org,2002:null", "null")
+        )
+        Representer.add_representer(
+            str,
+            lambda representer, text: representer.represent_scalar(
+                "tag:yaml.org,2002:str", text, style='"' if text.splitlines() not in ([], [text]) else None
+            ),
         )
         document = self.config.model_dump(mode="json")
         if self.rig_path is not None:

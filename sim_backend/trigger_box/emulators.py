@@ -179,9 +179,11 @@ class BoxEmulator:
     def _drive(self, level: Level | None, t_us: int) -> None:
         before, self._output = self._output, level
         if before is not None and before != level and level == self._trigger_level:
-            # Of two times modulo 2³² the difference that is nearest to 0.
-            ahead_us = (t_us - self._time_us() + (1 << 31)) % (1 << 32) - (1 << 31)
-            self._begun.append(self._clock.now() + ahead_us * 1e-6)
+            # One reading of the clock, or what comes between two would shift the pulse. Of two times modulo 2³² the
+            # difference that is nearest to 0.
+            now = self._clock.now()
+            ahead_us = (t_us - self._time_us(now) + (1 << 31)) % (1 << 32) - (1 << 31)
+            self._begun.append(now + ahead_us * 1e-6)
 
     def _receive(self, data: bytes) -> None:
         with self._lock:

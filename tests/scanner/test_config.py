@@ -16,7 +16,7 @@ from types import ModuleType, SimpleNamespace
 from typing import Annotated, Any, Literal
 
 import pytest
-from hypothesis import event, given, settings
+from hypothesis import event, example, given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, computed_field, model_validator
 from typing_extensions import TypeAliasType
@@ -694,6 +694,7 @@ def test_effective_yaml_reads_to_the_same_configuration(write: Any, tmp_path: Pa
     ),
     st.text(max_size=8),
 )
+@example({}, "\x85")  # a line break that YAML folds
 def test_effective_yaml_keeps_every_number_and_text(scan: dict[str, Any], serial: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench.yaml"
