@@ -1,6 +1,6 @@
 """What a device is, and the real ones. Knows nobody else."""
 
-from drivers.bench import Bench, BenchKind, LatencyBound
+from drivers.bench import Bench, BenchKind, LatencyBound, Presenter
 from drivers.clock import SystemClock
 from drivers.devices import (
     Camera,
@@ -62,6 +62,7 @@ __all__ = [
     "OperatorError",
     "Pixels",
     "PlayRecord",
+    "Presenter",
     "Projector",
     "ProtocolError",
     "SequenceFaultError",

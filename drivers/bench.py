@@ -97,6 +97,26 @@ class BenchKind(Protocol):
 
 
 @runtime_checkable
+class Presenter(Protocol):
+    """A bench before which something other than a person puts objects: a robot, or the simulation."""
+
+    def present(self, thing: Mapping[str, Any]) -> None:
+        """Put an object before the camera in place of what was there; it stands still when this returns.
+
+        Parameters
+        ----------
+        thing
+            JSON document of the object and its pose; which ones there are is the bench's matter.
+
+        Raises
+        ------
+        DeviceSettingError
+            The bench has no such object, or cannot hold it so.
+        """
+        ...
+
+
+@runtime_checkable
 class LatencyBound(Protocol):
     """A bench that has to know how much later than handed over a picture is on the surface."""
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import BaseModel
 
-from drivers import BenchKind, SteppedBench
+from drivers import BenchKind
 from sim_backend.clock import VirtualClock
+from sim_backend.scenes import scene_of
 from sim_backend.settings import SceneSettings, SimulatedSettings
 
 if TYPE_CHECKING:
+    from sim_backend.cache import RecentTransports
+    from sim_backend.stage import SimulatedBench
     from sim_backend.truth import Truth
 
 
@@ -26,14 +30,15 @@ class SimulatedBenchKind:
         return SimulatedSettings
 
     @contextmanager
-    def open(self, settings: SimulatedSettings) -> Iterator[SteppedBench]:
+    def open(self, settings: SimulatedSettings) -> Iterator[SimulatedBench]:
         """An open bench; the scene's light is traced first unless it is in the cache."""
         # Imported here, because tracing needs Open3D and Numba, and the settings alone need neither.
-        from sim_backend.cache import transport_of
         from sim_backend.devices import SimulatedCamera, SimulatedProjector
         from sim_backend.optics import Optics
+        from sim_backend.stage import SimulatedBench
 
-        optics = Optics.of(settings, transport_of(settings))
+        transports = _transports()
+        optics = Optics.of(settings, transports.of(settings))
         clock = VirtualClock(real_time=settings.real_time)
         projector = SimulatedProjector(settings.projector, clock, settings.faults)
         camera = SimulatedCamera(
@@ -42,7 +47,7 @@ class SimulatedBenchKind:
         settle_s = settings.settle_s
         if settle_s is None:
             settle_s = settings.projector.latency_s + projector.period_s
-        with SteppedBench(
+        with SimulatedBench(
             name=f"simulated {settings.scene.name}",
             camera=camera,
             projector=projector,
@@ -51,18 +56,37 @@ class SimulatedBenchKind:
             exposure_s=camera.exposure_s,
             timeout_s=2.0 + settings.camera.readout_s,
             simulated=True,
-            rig=settings.rig().to_json(),
+            rig=settings.rig().to_json() if settings.knows_rig else None,
+            settings=settings,
+            transports=transports,
         ) as bench:
             yield bench
 
 
-def truth_of(settings: SceneSettings) -> Truth:
-    """What is really there, for tests that judge a scan."""
-    from sim_backend.cache import transport_of
+@cache
+def _transports() -> RecentTransports:
+    """Those of this process: a bench that is opened again for another exposure finds its scene traced."""
+    from sim_backend.cache import RecentTransports
+
+    return RecentTransports()
+
+
+def truth_of(settings: SceneSettings, presented: Mapping[str, Any] | None = None) -> Truth:
+    """What is really there, for tests that judge a scan.
+
+    Parameters
+    ----------
+    settings
+        Of the bench.
+    presented
+        The document of what has been put before it in place of its own scene.
+    """
     from sim_backend.optics import Optics
     from sim_backend.truth import Truth
 
-    return Truth(Optics.of(settings, transport_of(settings)), settings.rig())
+    if presented is not None:
+        settings = settings.model_copy(update={"scene": scene_of(presented)})
+    return Truth(Optics.of(settings, _transports().of(settings)), settings.rig())
 
 
 kind: BenchKind = SimulatedBenchKind()

@@ -7,8 +7,10 @@ import json
 import logging
 import os
 import tempfile
+import threading
 import zipfile
 import zlib
+from collections import OrderedDict
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +25,17 @@ _SOURCES = (
     "camera_paths",
     "columns",
     "kernels",
+    "prints",
     "projector_paths",
     "raycasting",
     "reflection",
-    "scenes",
+    "scenes/__init__",
+    "scenes/artefacts",
+    "scenes/boards",
+    "scenes/mirrors",
+    "scenes/pose",
+    "scenes/shapes",
+    "sheets",
     "surfaces",
     "transport",
     "viewpoint",
@@ -34,11 +43,42 @@ _SOURCES = (
 """The modules that decide what tracing gives; their text is part of the content: no old result outlives them."""
 
 
+class RecentTransports:
+    """Light transport of what was looked at last, in memory: another exposure or another seed needs no tracing.
+
+    Parameters
+    ----------
+    count
+        How many are kept.
+    """
+
+    def __init__(self, count: int = 2) -> None:
+        self._count = count
+        self._kept: OrderedDict[str, Transport] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def of(self, settings: SceneSettings) -> Transport:
+        """The light transport of a bench, from memory if it is there, else as `transport_of`."""
+        content = _content_hash(settings)
+        with self._lock:
+            transport = self._kept.get(content)
+        if transport is None:
+            transport = transport_of(settings)
+        with self._lock:
+            self._kept[content] = transport
+            self._kept.move_to_end(content)
+            while len(self._kept) > self._count:
+                self._kept.popitem(last=False)
+        return transport
+
+
 def transport_of(settings: SceneSettings) -> Transport:
-    """The light transport of a bench, from the cache or traced anew and cached.
+    """The light transport of a bench, from the cache or traced anew and cached, if the scene may be seen again.
 
     A cache that cannot be read or written costs time, never the scan.
     """
+    if settings.scene.seen_once:
+        return trace(settings.scene.surfaces(), settings.rig(), settings.transport)
     path = _folder(settings) / f"transport-{_content_hash(settings)}.npz"
     if path.exists():
         try:

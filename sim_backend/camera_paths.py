@@ -149,7 +149,7 @@ class _Tracer:
         dy, dx = (d.ravel() for d in np.meshgrid(offset, offset, indexing="ij"))
         direction = unit(self.camera.rays(np.stack((x[..., None] + dx, y[..., None] + dy), -1).reshape(-1, 2)))
         hits = self.caster.first_hits(self.camera.centre, direction)
-        sub_uv, sub_radiance = self.lit(hits, -direction)
+        sub_uv, sub_radiance = self.lit(hits, -direction, self.sides(x, y, hits) if self.caster.sheets else None)
 
         surfaces, lit = hits.surface.reshape(-1, rays), (sub_radiance > 0).reshape(-1, rays)
         mixed = (surfaces != centre.surface[:, None]).any(1) | (lit != (radiance > 0)[:, None]).any(1)
@@ -172,12 +172,30 @@ class _Tracer:
         pixel = np.repeat(np.arange(first_row * width, end_row * width, dtype=np.int32), rays)
         return view, direct, *self.by_mirror(pixel, direction, hits)
 
-    def lit(self, hits: Hits, to_eye: Array) -> tuple[Array, Array]:
-        """Projector px (n, 2) of hit points, and the radiance (n,) that direct light gives them towards the eye."""
+    def sides(self, x: Array, y: Array, hits: Hits) -> Array:
+        """(rays, 2, 3) sides of what each ray's square in the picture covers of its surface, mm.
+
+        ``x``, ``y`` (rows, columns) are the pixel centres, whose squares stand for those of all rays of a pixel.
+        """
+        # Where a pixel sees several surfaces, one does for all: its print is not what matters there.
+        surface = hits.surface.reshape(-1, self.supersample**2).max(1)
+        ends = []
+        for dx, dy in ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)):
+            direction = self.camera.rays(np.stack((x + dx, y + dy), -1).reshape(-1, 2))
+            ends.append(self.caster.extended(surface, self.camera.centre, direction))
+        sides = np.stack((ends[0] - ends[1], ends[2] - ends[3]), 1) / self.supersample
+        return np.repeat(sides, self.supersample**2, axis=0)
+
+    def lit(self, hits: Hits, to_eye: Array, sides: Array | None = None) -> tuple[Array, Array]:
+        """Projector px (n, 2) of hit points, and the radiance (n,) that direct light gives them towards the eye.
+
+        ``sides`` as `RayCaster.diffuse`.
+        """
         uv = self.projector.project(hits.point)
         irradiance = self.projector.density(uv, hits.point, hits.normal)
         radiance = reflected_radiance(
             self.caster.materials,
+            self.caster.diffuse(hits, sides),
             hits.surface,
             self.projector.centre,
             hits.point,

@@ -255,6 +255,10 @@ class SimulatedCamera:
         """How many were triggered since the camera was made."""
         return self._exposures
 
+    def look_at(self, optics: Optics) -> None:
+        """Have another scene before the lens from now on; noise, faults and counts go on."""
+        self._optics = optics
+
     def open(self) -> None:
         """Connect.
 

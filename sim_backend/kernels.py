@@ -174,8 +174,8 @@ def _spline(t, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compi
 def meet(shapes, surface, origin, direction):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Exact points (n, 3) and normals (n, 3) towards the origin where rays meet the surfaces they are known to meet.
 
-    ``shapes`` (surfaces, 7) as `sim_backend.surfaces.Surface.shape`, ``surface`` (n,) with -1 for a miss, which gives
-    NaN, ``origin`` and ``direction`` (n, 3).
+    ``shapes`` (surfaces, 12) as `sim_backend.surfaces.shape_of`, ``surface`` (n,) with -1 for a miss, which gives NaN,
+    ``origin`` and ``direction`` (n, 3).
     """
     point, normal = np.full(direction.shape, np.nan), np.full(direction.shape, np.nan)
     for i in range(surface.size):
@@ -194,11 +194,33 @@ def meet(shapes, surface, origin, direction):  # type: ignore[no-untyped-def]  #
             nx, ny, nz = (ox + t * dx) / radius, (oy + t * dy) / radius, (oz + t * dz) / radius
         else:
             nx, ny, nz = shape[4], shape[5], shape[6]
-            t = -(ox * nx + oy * ny + oz * nz) / (dx * nx + dy * ny + dz * nz)
+            above, rise = ox * nx + oy * ny + oz * nz, dx * nx + dy * ny + dz * nz
+            t = -above / rise
+            if shape[7] != 0:
+                ax, ay, az = shape[8], shape[9], shape[10]
+                x, run = ox * ax + oy * ay + oz * az, dx * ax + dy * ay + dz * az
+                t = _parabola(shape[7], shape[11], x, run, above, rise)
+                slope = 2 * shape[7] * (x + t * run)
+                length = math.sqrt(1 + slope * slope)
+                nx, ny, nz = (nx - slope * ax) / length, (ny - slope * ay) / length, (nz - slope * az) / length
         side = -1.0 if dx * nx + dy * ny + dz * nz > 0 else 1.0
         point[i, 0], point[i, 1], point[i, 2] = origin[i, 0] + t * dx, origin[i, 1] + t * dy, origin[i, 2] + t * dz
         normal[i, 0], normal[i, 1], normal[i, 2] = side * nx, side * ny, side * nz
     return point, normal
+
+
+@njit(inline="always")
+def _parabola(curvature, half_width, x, run, z, rise):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Where on the ray (x + t run, z + t rise) z = curvature x², within ``half_width`` if it is anywhere."""
+    a, b, c = curvature * run * run, 2 * curvature * x * run - rise, curvature * x * x - z
+    q = -0.5 * (b + math.copysign(math.sqrt(max(0.0, b * b - 4 * a * c)), b))
+    # The first is that of the plane, but for the curvature; the second lies far off, unless the ray grazes the sheet.
+    t = c / q
+    if a != 0:
+        other = q / a
+        if other > 0 and abs(x + other * run) <= half_width and (t <= 0 or other < t or abs(x + t * run) > half_width):
+            t = other
+    return t
 
 
 @njit(cache=True, nogil=True)
@@ -222,18 +244,18 @@ def pixel_density(grid, step, size, centre, axis, px, point, normal):  # type: i
 
 
 @njit(cache=True, nogil=True)
-def reflected_radiance(materials, surface, light, point, normal, to_eye, irradiance):  # type: ignore[no-untyped-def]  # pragma: no cover
+def reflected_radiance(materials, diffuse, surface, light, point, normal, to_eye, irradiance):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Radiance (n,) towards the eye that irradiance (n,) from ``light`` (3,) causes; see `sim_backend.reflection`.
 
     ``materials`` (surfaces, 3): diffuse and specular share, concentration of the lobe (inf for a perfect mirror, whose
-    lobe no finite light hits).
+    lobe no finite light hits); ``diffuse`` (n,) the diffuse share at the very points.
     """
     radiance = np.zeros(len(irradiance))
     for i in range(len(irradiance)):
         if irradiance[i] <= 0 or surface[i] < 0:
             continue
-        diffuse, specular, concentration = materials[surface[i]]
-        value = diffuse / math.pi
+        _, specular, concentration = materials[surface[i]]
+        value = diffuse[i] / math.pi
         if specular > 0 and concentration < math.inf:
             lx, ly, lz = light[0] - point[i, 0], light[1] - point[i, 1], light[2] - point[i, 2]
             length = math.sqrt(lx * lx + ly * ly + lz * lz)

@@ -15,6 +15,7 @@ load_libusb()  # before Open3D, which needs it
 import open3d as o3d  # noqa: E402
 
 from sim_backend.kernels import meet  # noqa: E402
+from sim_backend.sheets import Sheet  # noqa: E402
 from sim_backend.surfaces import Array, Surface  # noqa: E402
 
 CLEARANCE_MM = 0.01
@@ -57,6 +58,8 @@ class RayCaster:
             [(m.diffuse, m.specular, m.concentration) for m in (surface.material for surface in surfaces)]
         )
         """(surfaces, 3) diffuse share, specular share, concentration of the lobe."""
+        self.sheets = {number: surface for number, surface in enumerate(surfaces) if isinstance(surface, Sheet)}
+        """The printed ones, by number."""
 
     def first_hits(self, origin: Array, direction: Array, leaving: Array | None = None) -> Hits:
         """What rays meet first.
@@ -76,6 +79,27 @@ class RayCaster:
         surface = cast["geometry_ids"].numpy().astype(np.int16)
         begin = np.array(np.broadcast_to(origin, direction.shape), order="C")
         return Hits(surface, *meet(self._shapes, surface, begin, direction))
+
+    def extended(self, surface: NDArray[np.int16], origin: Array, direction: Array) -> Array:
+        """(n, 3) mm, where rays from ``origin`` (3,) meet surfaces (n,), or what goes on beyond their edges."""
+        begin = np.array(np.broadcast_to(origin, direction.shape), order="C")
+        return np.asarray(meet(self._shapes, surface, begin, direction)[0])
+
+    def diffuse(self, hits: Hits, sides: Array | None = None) -> Array:
+        """(n,) share of the light that the surfaces scatter evenly where they are hit.
+
+        Parameters
+        ----------
+        hits
+            (n,) hits.
+        sides
+            (n, 2, 3) mm, sides of the parallelograms over which the mean of a print is taken; None for points.
+        """
+        share: Array = self.materials[hits.surface, 0]
+        for number, sheet in self.sheets.items():
+            at = np.flatnonzero(hits.surface == number)
+            share[at] = sheet.reflectance(hits.point[at], np.zeros((at.size, 2, 3)) if sides is None else sides[at])
+        return share
 
     def visible(self, point: Array, normal: Array, target: Array) -> NDArray[np.bool_]:
         """Whether nothing stands between points (n, 3), seen from the side of their normals, and ``target`` (3,)."""

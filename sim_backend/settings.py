@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sim_backend.scenes import MirrorScene, Scene
 
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from scanner.rig import Lens, Rig
 
 _Count = Annotated[int, Field(ge=0)]
+_ROUNDING = 1e-9
+_LEAST_SPARE = 0.98
+"""Of the radius at which a lens folds back, for what its tangential distortion adds."""
 
 
 class _Section(BaseModel):
@@ -30,17 +33,47 @@ class _Picture(_Section):
     width_px: int = Field(1024, ge=16, le=16384, description="Width of the picture, px.")
     height_px: int = Field(768, ge=16, le=16384, description="Height of the picture, px.")
     field_of_view_deg: float = Field(28.7, gt=1, lt=120, description="Horizontal field of view without distortion, °.")
+    principal_offset_px: tuple[float, float] = Field(
+        (0.0, 0.0), description="Principal point to the right of and below the picture's middle, [x, y] px."
+    )
     distortion_k1: float = Field(
         0.0, ge=-0.3, le=0.3, description="First radial distortion term k1 of OpenCV's lens model; 0 is a perfect lens."
     )
+    distortion_k2: float = Field(0.0, ge=-1, le=1, description="Second radial distortion term k2.")
+    distortion_k3: float = Field(0.0, ge=-2, le=2, description="Third radial distortion term k3.")
+    distortion_p1: float = Field(0.0, ge=-0.02, le=0.02, description="First tangential distortion term p1.")
+    distortion_p2: float = Field(0.0, ge=-0.02, le=0.02, description="Second tangential distortion term p2.")
+
+    @model_validator(mode="after")
+    def _reaches_the_corners(self) -> Self:
+        """Refuse a lens that draws no ray at some of its pixels, because its distortion folds back."""
+        k1, k2, k3 = self.distortion_k1, self.distortion_k2, self.distortion_k3
+        turns = np.polynomial.Polynomial([1.0, 3 * k1, 5 * k2, 7 * k3]).trim().roots()
+        turning = turns.real[(np.abs(turns.imag) < _ROUNDING) & (turns.real > 0)]
+        if turning.size:
+            squared = float(turning.min())
+            reach = math.sqrt(squared) * (1 + squared * (k1 + squared * (k2 + squared * k3)))
+            x, y = (abs(shift) + n / 2 for shift, n in zip(self.principal_offset_px, self._size, strict=True))
+            if math.hypot(x, y) / self._focal_px >= _LEAST_SPARE * reach:
+                raise ValueError("the distortion folds back within the picture: some pixels would see nothing")
+        return self
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        return self.width_px, self.height_px
+
+    @property
+    def _focal_px(self) -> float:
+        return self.width_px / 2 / math.tan(math.radians(self.field_of_view_deg / 2))
 
     def lens(self) -> Lens:
-        """The same as a camera model, the principal point in the middle."""
+        """The same as a camera model."""
         from scanner.rig import Lens
 
-        focal = self.width_px / 2 / math.tan(math.radians(self.field_of_view_deg / 2))
-        matrix = np.array([[focal, 0, (self.width_px - 1) / 2], [0, focal, (self.height_px - 1) / 2], [0, 0, 1]])
-        return Lens(matrix, np.array([self.distortion_k1, 0.0, 0.0, 0.0, 0.0]), (self.width_px, self.height_px))
+        cx, cy = ((n - 1) / 2 + shift for n, shift in zip(self._size, self.principal_offset_px, strict=True))
+        matrix = np.array([[self._focal_px, 0, cx], [0, self._focal_px, cy], [0, 0, 1]])
+        names = ("k1", "k2", "p1", "p2", "k3")
+        return Lens(matrix, np.array([getattr(self, f"distortion_{name}") for name in names]), self._size)
 
 
 class CameraSettings(_Picture):
@@ -163,6 +196,16 @@ class SceneSettings(_Section):
         le=100_000,
         description="Where the projector's axis crosses the camera's: distance from the camera, mm.",
     )
+    projector_height_mm: float = Field(
+        0.0, ge=-10_000, le=10_000, description="Height of the projector above the camera, mm; negative: below it."
+    )
+    projector_roll_deg: float = Field(
+        0.0,
+        ge=-180,
+        le=180,
+        description="Turn of the projector about its own axis, °; positive turns its picture clockwise for one who"
+        " stands behind it.",
+    )
     seed: int = Field(0, ge=0, description="Seed of the camera noise: the same seed gives the same frames.")
     transport: TransportSettings = Field(TransportSettings(), description="How finely light is traced.")
     cache_dir: Path | None = Field(
@@ -175,14 +218,17 @@ class SceneSettings(_Section):
     )
 
     def rig(self) -> Rig:
-        """The rig as it truly stands: the projector left of the camera, turned in about the vertical."""
+        """The rig as it truly stands: the projector left of the camera, turned in until their axes meet."""
         from scanner.rig import Rig
 
-        centre = np.array([-self.baseline_mm, 0.0, 0.0])
+        centre = np.array([-self.baseline_mm, -self.projector_height_mm, 0.0])
         z = np.array([0.0, 0.0, self.convergence_mm]) - centre
         z /= np.linalg.norm(z)
-        y = np.array([0.0, 1.0, 0.0])
-        rotation = np.stack((np.cross(y, z), y, z))
+        x = np.cross([0.0, 1.0, 0.0], z)
+        x /= np.linalg.norm(x)
+        y = np.cross(z, x)
+        cos, sin = math.cos(math.radians(self.projector_roll_deg)), math.sin(math.radians(self.projector_roll_deg))
+        rotation = np.stack((cos * x + sin * y, cos * y - sin * x, z))
         return Rig(
             self.camera.lens(), self.projector.lens(), rotation, -rotation @ centre, {"source": "simulated bench"}
         )
@@ -197,5 +243,6 @@ class SimulatedSettings(SceneSettings):
         le=60,
         description="From showing a picture to the trigger, s; left out, the latency and one refresh, which suffice.",
     )
+    knows_rig: bool = Field(True, description="False: a bench that nobody has calibrated yet; it knows no rig.")
     faults: FaultSettings = Field(FaultSettings(), description="Faults to provoke.")
     real_time: bool = Field(False, description="Let simulated time really pass.")

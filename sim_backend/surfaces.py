@@ -60,8 +60,36 @@ class Surface(Protocol):
 
     @property
     def shape(self) -> Array:
-        """(7,) the exact shape: centre (mm), radius (mm), and for a plane, which has radius 0, the unit normal."""
+        """(12,) the exact shape, see `shape_of`."""
         ...
+
+
+def shape_of(
+    centre: Array,
+    *,
+    radius: float = 0.0,
+    normal: Array | None = None,
+    along: Array | None = None,
+    curvature: float = 0.0,
+    half_width: float = 0.0,
+) -> Array:
+    """(12,) a shape as the kernel `sim_backend.kernels.meet` takes it.
+
+    Parameters
+    ----------
+    centre
+        (3,) mm, of a sphere, or a point of a plane or of the apex line of a parabolic cylinder.
+    radius
+        Of a sphere, mm; 0 for the others.
+    normal
+        (3,) unit normal of the plane, or at the apex line.
+    along, curvature, half_width
+        Of a parabolic cylinder z = c x²: (3,) unit vector along x, at right angles to the normal, which is along z; c,
+        1/mm; how far it goes along x, mm.
+    """
+    nothing = np.zeros(3)
+    normal = nothing if normal is None else normal
+    return np.concatenate((centre, [radius], normal, [curvature], nothing if along is None else along, [half_width]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +127,7 @@ class Rectangle:
     @property
     def shape(self) -> Array:
         """Its plane."""
-        return np.concatenate((self.centre, [0.0], self.normal))
+        return shape_of(self.centre, normal=self.normal)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,4 +170,4 @@ class Sphere:
     @property
     def shape(self) -> Array:
         """Centre and radius."""
-        return np.concatenate((self.centre, [self.radius], np.zeros(3)))
+        return shape_of(self.centre, radius=self.radius)

@@ -153,9 +153,22 @@ def trace(surfaces: Sequence[Surface], rig: Rig, settings: TransportSettings) ->
     """Trace all light of a scene; deterministic."""
     caster, camera, projector = RayCaster(surfaces), Viewpoint.camera(rig), Viewpoint.projector(rig)
     seen = trace_camera(caster, camera, projector, settings.supersample, settings.specular_bounces)
-    bounces = _Bounces(caster, camera, projector, seen.view)
+    # A lone surface throws no light on itself: each is flat or convex, or a sheet bent so little that it hardly does.
+    bounced = _bounced(surfaces, _Bounces(caster, camera, projector, seen.view), settings) if len(surfaces) > 1 else []
+    return Transport(
+        rig.projector.size,
+        seen.view,
+        seen.direct,
+        _over_pixels(seen.by_mirror, seen.view.surface.size, rig.projector.size),
+        tuple(bounced),
+        seen.seen_in_mirror,
+    )
+
+
+def _bounced(surfaces: Sequence[Surface], bounces: _Bounces, settings: TransportSettings) -> list[Bounce]:
+    """The light that the surfaces throw on one another."""
     bounced: list[Bounce] = []
-    lit = _first_surfaces(caster, projector)
+    lit = _first_surfaces(bounces.caster, bounces.projector)
     materials = [surface.material for surface in surfaces]
     for number, material in enumerate(materials):
         if material.specular:
@@ -168,16 +181,9 @@ def trace(surfaces: Sequence[Surface], rig: Rig, settings: TransportSettings) ->
     anywhere, most = lit != MISS, settings.diffuse_bounces
     if bounces.trace(materials, anywhere, None, _PILOT_PHOTONS, most).u.size:
         found = bounces.trace(materials, anywhere, None, settings.photons, most)
-        block, cell = max(1, rig.projector.size[0] // 40), max(1, rig.camera.size[0] // 64)
+        block, cell = max(1, bounces.projector.lens.size[0] // 40), max(1, bounces.camera.lens.size[0] // 64)
         bounced += bounces.gathered(found, cell, block, diffuse=True)
-    return Transport(
-        rig.projector.size,
-        seen.view,
-        seen.direct,
-        _over_pixels(seen.by_mirror, seen.view.surface.size, rig.projector.size),
-        tuple(bounced),
-        seen.seen_in_mirror,
-    )
+    return bounced
 
 
 def _with_lobe(materials: Sequence[Material], number: int, factor: float) -> list[Material]:

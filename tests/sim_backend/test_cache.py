@@ -1,10 +1,12 @@
+import ast
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sim_backend import cache
-from sim_backend.cache import transport_of
+from sim_backend.cache import RecentTransports, transport_of
 from sim_backend.settings import SimulatedSettings
 
 
@@ -120,3 +122,34 @@ def test_environment_names_the_folder_unless_the_settings_do(settings, tmp_path,
     assert _entry(tmp_path / "by-environment").exists()
     transport_of(settings())
     assert _entry(tmp_path / "cache").exists()
+
+
+def test_memory_keeps_what_was_looked_at_last(settings, traced):
+    recent = RecentTransports(count=2)
+    board, sphere, plane = (settings(scene, cache_limit_mb=0) for scene in ("board", "sphere", "plane"))
+    first = recent.of(board)
+    recent.of(sphere)
+    assert recent.of(board) is first
+    assert recent.of(board.model_copy(update={"seed": 4})) is first
+    recent.of(plane)  # forgets the sphere
+    assert recent.of(board) is first
+    assert len(traced) == 3
+    recent.of(sphere)
+    assert len(traced) == 4
+
+
+def test_every_module_that_decides_the_light_is_part_of_the_content():
+    """Those that tracing and scenes import, and their imports; of the settings, the values are in the content."""
+    folder = Path(cache.__file__).parent
+    found, todo = set(), ["cache", "scenes/boards"]
+    while todo:
+        name = todo.pop()
+        found.add(name)
+        for node in ast.walk(ast.parse((folder / f"{name}.py").read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sim_backend."):
+                imported = node.module.removeprefix("sim_backend.").replace(".", "/")
+                imported = f"{imported}/__init__" if (folder / imported).is_dir() else imported
+                if imported not in found and imported != "settings":
+                    todo.append(imported)
+    scenes = {f"scenes/{path.stem}" for path in (folder / "scenes").glob("*.py")}
+    assert set(cache._SOURCES) == found | scenes

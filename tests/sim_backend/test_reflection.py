@@ -22,7 +22,14 @@ def _brdf(material, to_light, to_eye):
     return np.array(
         [
             reflected_radiance(
-                materials, np.zeros(1, np.int16), i, np.zeros((1, 3)), np.array([[0.0, 0, 1]]), o[None], one
+                materials,
+                materials[:, 0],
+                np.zeros(1, np.int16),
+                i,
+                np.zeros((1, 3)),
+                np.array([[0.0, 0, 1]]),
+                o[None],
+                one,
             )[0]
             for i, o in zip(to_light, to_eye, strict=True)
         ]

@@ -1,0 +1,88 @@
+"""Where an object is, how it is turned, and what its surface is like."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from sim_backend.surfaces import Array, Material, Rectangle
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Length = Annotated[float, Field(gt=0, le=10_000)]
+
+
+class Pose(BaseModel):
+    """Where a scene is and how it is turned."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    seen_once: ClassVar[bool] = False
+    """Whether it is not worth keeping on disk how its light goes, because it will not be seen like this again."""
+
+    distance_mm: Length = Field(600.0, description="Distance of the scene's origin along the camera's axis, mm.")
+    offset_x_mm: float = Field(0.0, description="The origin's place to the right of the camera's axis, mm.")
+    offset_y_mm: float = Field(0.0, description="The origin's place below the camera's axis, mm.")
+    yaw_deg: float = Field(
+        0.0, ge=-80, le=80, description="Turn about the vertical; positive turns the front to the left, °."
+    )
+    pitch_deg: float = Field(0.0, ge=-80, le=80, description="Turn about the horizontal after the yaw, °.")
+    roll_deg: float = Field(
+        0.0,
+        ge=-180,
+        le=180,
+        description="Turn about the scene's own z before the yaw; positive turns it clockwise for the camera, °.",
+    )
+
+    @property
+    def rotation(self) -> Array:
+        """(3, 3) from the scene's frame to the camera frame: Rx(pitch)·Ry(yaw)·Rz(roll)."""
+        yaw, pitch, roll = (math.radians(a) for a in (self.yaw_deg, self.pitch_deg, self.roll_deg))
+        cy, sy, cp, sp, cr, sr = (f(a) for a in (yaw, pitch, roll) for f in (math.cos, math.sin))
+        about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
+        about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+        about_z = np.array([[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]])
+        return np.asarray(about_x @ about_y @ about_z)
+
+    def turned(self, vector: tuple[float, float, float]) -> Array:
+        """(3,) a direction of the scene's frame in the camera frame."""
+        return np.asarray(self.rotation @ np.array(vector, np.float64))
+
+    def placed(self, point: tuple[float, float, float]) -> Array:
+        """(3,) a point of the scene's frame in the camera frame, mm."""
+        return np.asarray(np.add(self.turned(point), (self.offset_x_mm, self.offset_y_mm, self.distance_mm)))
+
+    def rectangle(
+        self,
+        centre: tuple[float, float, float],
+        half_width: tuple[float, float, float],
+        half_height: tuple[float, float, float],
+        material: Material,
+    ) -> Rectangle:
+        """A rectangle given in the scene's frame."""
+        return Rectangle(self.placed(centre), self.turned(half_width), self.turned(half_height), material)
+
+
+class Finish(BaseModel):
+    """What the surface of an object is like."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    reflectance: Share = Field(0.8, description="Share of the light that is scattered evenly (white paint: 0.8).")
+    gloss: Share = Field(0.0, description="Share of the light that goes into the lobe about the mirror direction.")
+    roughness: Share = Field(
+        0.3, description="Breadth of that lobe, 0 (mirror) to 1; its standard deviation is √2·roughness² rad."
+    )
+
+    @model_validator(mode="after")
+    def _conserves_energy(self) -> Self:
+        if self.reflectance + self.gloss > 1:
+            raise ValueError("reflectance + gloss must not exceed 1: a surface gives back no more than it gets")
+        return self
+
+    @property
+    def material(self) -> Material:
+        """The same for the light transport."""
+        return Material(self.reflectance, self.gloss, self.roughness)
