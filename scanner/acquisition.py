@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Protocol
 
@@ -142,6 +142,8 @@ class Acquisition:
         Where everything is recorded; the caller ends it.
     listener
         Is told how it goes.
+    response
+        Light of the projector's grey levels that the patterns are corrected for, as `scanner.patterns.Plan`.
     """
 
     bench: Bench
@@ -150,6 +152,7 @@ class Acquisition:
     decoder: Decoder
     take: TakeWriter
     listener: Listener = field(default_factory=Silence)
+    response: tuple[float, ...] | None = None
     state: ScanState = field(default=ScanState.IDLE, init=False)
     timings_s: dict[str, float] = field(default_factory=dict, init=False)
     frames: dict[int, int] = field(default_factory=dict, init=False)
@@ -172,7 +175,8 @@ class Acquisition:
         """
         try:
             with self._dark_afterwards():
-                first_plan = self.method.first_round(self.scan, self.bench.projector_size)
+                planned = self.method.first_round(self.scan, self.bench.projector_size)
+                first_plan = replace(planned, response=self.response)
                 self._enter(ScanState.PREFLIGHT, "exposure check")
                 levels = self._preflight(first_plan)
                 self._history.begin_round(
@@ -256,7 +260,7 @@ class Acquisition:
         """Frames under the brightest and the darkest level of the fringes, where the plan lights at all."""
         width, height = self.bench.projector_size
         levels = (plan.mean + plan.amplitude, plan.mean - plan.amplitude)
-        pictures = [np.full((height, width), round(255 * level), np.uint8) for level in levels]
+        pictures = [np.full((height, width), plan.grey(level), np.uint8) for level in levels]
         if plan.mask is not None:
             pictures = [np.where(plan.mask, picture, np.uint8(0)) for picture in pictures]
         fmt = self.bench.frame_format

@@ -6,56 +6,31 @@ Exit codes: 0 done; 2 bad configuration or usage; 3 hardware; 4 the scan ran but
 
 from __future__ import annotations
 
-import functools
-import signal
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, ParamSpec
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from scanner.command_line import (
+    ConfigOption,
+    OverwriteOption,
+    QuietOption,
+    SetOption,
+    interruptible,
+    new_app,
+    overrides,
+    run,
+)
 
 if TYPE_CHECKING:
     from scanner.config import GatesSection, LoadedConfig, ScanSection
     from scanner.result import ScanResult
     from scanner.terminal import Terminal
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=False,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+app = new_app()
 
 NOT_READY = 3
 GATES_FAILED = 4
-INTERRUPTED = 130
-
-ConfigOption = Annotated[Path, typer.Option("--config", "-c", help="Bench file (YAML).", show_default=False)]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing result folder.")]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Plain lines instead of a progress bar.")]
-SetOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Replace a value of the file: scan.steps=8.")
-]
-
-
-P = ParamSpec("P")
-
-
-def interruptible(command: Callable[P, None]) -> Callable[P, None]:
-    """Let Ctrl-C end a command with a word; the result folder has added where the recording was kept."""
-
-    @functools.wraps(command)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> None:
-        try:
-            command(*args, **kwargs)
-        except KeyboardInterrupt as interruption:
-            print("\n".join(["interrupted", *getattr(interruption, "__notes__", [])]), file=sys.stderr)
-            raise typer.Exit(INTERRUPTED) from None
-
-    return wrapped
 
 
 @app.callback(invoke_without_command=True)
@@ -78,7 +53,7 @@ def scan(
     from scanner.config import load_config
     from scanner.terminal import Terminal
 
-    loaded = load_config(config, _overrides(sets, method))
+    loaded = load_config(config, overrides(sets, method))
     terminal = Terminal(quiet)
     terminal.say(loaded.warnings)
     result, path = _scan(loaded, out or _default_out("scan"), overwrite, terminal)
@@ -167,7 +142,7 @@ def compare(
     terminal = Terminal(quiet)
     results: dict[str, ScanResult] = {}
     names = [name.strip() for name in methods.split(",") if name.strip()]
-    loads = {name: load_config(config, _overrides(sets, name)) for name in names}
+    loads = {name: load_config(config, overrides(sets, name)) for name in names}
     with ComparisonFolder(out or _default_out("comparison"), overwrite=overwrite) as folder:
         if reuse is not None:
             known = read_result(reuse)
@@ -206,7 +181,7 @@ def doctor(
     from scanner.doctor.page import show, to_json, worst
     from scanner.doctor.session import run_doctor
 
-    loaded = None if config is None else load_config(config, _overrides(sets, None))
+    loaded = None if config is None else load_config(config, overrides(sets, None))
     console = Console(highlight=False)
     name = None if config is None else str(config)
     if as_json:
@@ -240,7 +215,7 @@ def preview(
     from scanner.config import load_config
     from scanner.preview.session import run_preview
 
-    loaded = load_config(config, _overrides(sets, None))
+    loaded = load_config(config, overrides(sets, None))
     console = Console(highlight=False, soft_wrap=True)
     run_preview(loaded, pattern, console, coloured=saturation, once=once, path=save)
 
@@ -256,7 +231,7 @@ def latency(config: ConfigOption, quiet: QuietOption = False, sets: SetOption = 
     terminal = Terminal(quiet)
     with terminal.working() as report:
         found, rig = measure_latency(
-            load_config(config, _overrides(sets, None)), lambda done, total: report(f"step {done} of {total}")
+            load_config(config, overrides(sets, None)), lambda done, total: report(f"step {done} of {total}")
         )
     terminal.say(
         [
@@ -313,21 +288,6 @@ def _sections(
     )
 
 
-def _overrides(sets: list[str] | None, method: str | None) -> dict[str, object]:
-    """Values from the command line, read as YAML scalars."""
-    from ruamel.yaml import YAML
-
-    found: dict[str, object] = {}
-    for item in sets or []:
-        key, equals, value = item.partition("=")
-        if not equals:
-            raise typer.BadParameter(f"--set {item}: write KEY=VALUE, such as scan.steps=8")
-        found[key.strip()] = YAML(typ="safe").load(value)
-    if method is not None:
-        found["scan.method"] = method
-    return found
-
-
 def _default_out(stem: str) -> Path:
     from datetime import datetime
 
@@ -341,41 +301,6 @@ def _exit_by_gates(result: ScanResult) -> None:
         raise typer.Exit(GATES_FAILED)
 
 
-@contextmanager
-def _terminable() -> Iterator[None]:
-    """A request to end (SIGTERM) is treated like Ctrl-C: the light goes out and the recording is closed."""
-
-    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 def main() -> None:
-    """Entry point of `scan`: every error an operator can meet is a message, never a traceback."""
-    try:
-        with _terminable():
-            code = app(standalone_mode=False)
-    except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
-    except Exception as error:
-        sys.exit(_explain(error))
-    sys.exit(code if isinstance(code, int) else 0)
-
-
-def _explain(error: Exception) -> int:
-    """Show an error that an operator can mend and return its exit code; a fault of the program is raised again."""
-    from drivers.errors import OperatorError
-
-    if isinstance(error, OperatorError):
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
-    show = getattr(error, "show", None)  # what the command-line parser refuses
-    if show is None:
-        raise error
-    show()
-    return int(getattr(error, "exit_code", 2))
+    """Entry point of `scan`."""
+    run(app)

@@ -13,7 +13,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from scanner.response import checked_light, nearest_levels
 
 Axis = Literal["x", "y"]
 
@@ -97,6 +99,9 @@ class Plan:
         A and B as fractions of the projector's full scale; ``mean ± amplitude`` must stay within 0..1.
     mask
         (height, width) bool, the projector pixels that are lit; None lights all. Elsewhere the pattern is black.
+    response
+        Light of each of the 256 grey levels, 0..1 and nowhere falling, for which the pictures are corrected
+        (`scanner.response.ProjectorResponse.values`); None for a projector whose light follows the grey level.
     """
 
     size: tuple[int, int]
@@ -104,6 +109,7 @@ class Plan:
     mean: float = 0.5
     amplitude: float = 0.5
     mask: NDArray[np.bool_] | None = field(default=None, compare=False)
+    response: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         if not self.sequences:
@@ -114,6 +120,8 @@ class Plan:
             raise ValueError(
                 f"mask {self.mask.shape} does not have the projector's shape {(self.size[1], self.size[0])}"
             )
+        if self.response is not None:
+            checked_light(self.response)
 
     @property
     def frame_count(self) -> int:
@@ -133,15 +141,21 @@ class Plan:
         """Projector pixels along ``axis``."""
         return self.size[0] if axis == "x" else self.size[1]
 
+    def grey(self, light: ArrayLike) -> NDArray[np.uint8]:
+        """Grey levels that come nearest to ``light`` (fractions of full scale, any shape)."""
+        if self.response is None:
+            return np.rint(255 * np.asarray(light, np.float64)).astype(np.uint8)
+        return nearest_levels(self.response, light)
+
     def render(self, sequence: int) -> list[NDArray[np.uint8]]:
-        """(height, width) 8-bit pictures of one sequence, rounded to the nearest grey level."""
+        """(height, width) 8-bit pictures of one sequence, in the grey levels whose light comes nearest."""
         chosen = self.sequences[sequence]
         width, height = self.size
         u = np.arange(self.extent(chosen.axis), dtype=np.float64)
         pictures = []
         for fringe in chosen.fringes:
             line = self.mean + self.amplitude * np.cos(2 * np.pi * fringe.frequency * u + fringe.step_rad)
-            grey = np.rint(255 * line).astype(np.uint8)
+            grey = self.grey(line)
             picture = np.broadcast_to(grey if chosen.axis == "x" else grey[:, None], (height, width))
             if self.mask is not None:
                 picture = np.where(self.mask, picture, np.uint8(0))
@@ -158,13 +172,14 @@ class Plan:
                 {"axis": s.axis, "fringes": [[f.frequency, f.step_rad] for f in s.fringes]} for s in self.sequences
             ],
             "mask": None if self.mask is None else _run_lengths(self.mask),
+            "response": None if self.response is None else list(self.response),
         }
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Plan:
         """Inverse of `to_json`."""
         width, height = document["size"]
-        mask = document.get("mask")
+        mask, response = document.get("mask"), document.get("response")
         return cls(
             size=(width, height),
             sequences=tuple(
@@ -174,6 +189,7 @@ class Plan:
             mean=document["mean"],
             amplitude=document["amplitude"],
             mask=None if mask is None else _from_run_lengths(mask, (height, width)),
+            response=None if response is None else tuple(response),
         )
 
 

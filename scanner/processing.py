@@ -13,6 +13,7 @@ from scanner.integrity import check_sequence
 from scanner.methods import METHODS, Method, RoundFrames
 from scanner.patterns import Plan
 from scanner.quality import summarise
+from scanner.response import corrected_for
 from scanner.result import ScanResult
 from scanner.rig import Rig
 from scanner.take import Take, TakeError
@@ -70,6 +71,7 @@ def process_take(
         frames=frames,
         timings_s=timings,
         bench=f"{take.manifest['bench'].get('name', 'unknown bench')}, take {take.manifest['uid']}",
+        projector=corrected_for(take.rounds[1].get("response"), (take.manifest.get("rig") or {}).get("metadata", {})),
         warnings=[*warnings, *decoder.warnings],
     )
 

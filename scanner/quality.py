@@ -28,6 +28,7 @@ def summarise(
     frames: Mapping[str, int],
     timings_s: Mapping[str, float],
     bench: str,
+    projector: str = "",
     warnings: Sequence[str] = (),
 ) -> ScanResult:
     """Count, judge and pack a result.
@@ -48,6 +49,8 @@ def summarise(
         Seconds by stage.
     bench
         Where the frames come from, in words.
+    projector
+        What the patterns took its response to be, in words, where that is known.
     warnings
         Sentences for the operator; those about failed gates are added.
     """
@@ -124,6 +127,7 @@ def summarise(
         maps,
         {
             "bench": bench,
+            **({"projector response": projector} if projector else {}),
             "counts": counts,
             "frames": dict(frames),
             "timings_s": dict(timings_s),

@@ -15,6 +15,7 @@ from scanner.decoding import Decoder
 from scanner.folder import ResultFolder, write_result
 from scanner.methods import METHODS
 from scanner.quality import summarise
+from scanner.response import corrected_for, response_of
 from scanner.result import ScanResult
 from scanner.rig import Rig
 from scanner.take import TakeWriter
@@ -26,7 +27,13 @@ DISPLAY_LATENCY = "display_latency"
 """Name of the latency among the notes of a rig."""
 
 
-def run_scan(loaded: LoadedConfig, out: Path, overwrite: bool, listener: Listener) -> tuple[ScanResult, Path]:
+def run_scan(
+    loaded: LoadedConfig,
+    out: Path,
+    overwrite: bool,
+    listener: Listener,
+    ready: Callable[[Bench], None] = lambda bench: None,
+) -> tuple[ScanResult, Path]:
     """Scan and write the result folder.
 
     Parameters
@@ -37,6 +44,8 @@ def run_scan(loaded: LoadedConfig, out: Path, overwrite: bool, listener: Listene
         The result folder; an existing one is refused unless ``overwrite``.
     listener
         Is told how it goes.
+    ready
+        Called with the open bench before anything is projected: whatever has to be placed before it.
 
     Returns
     -------
@@ -53,14 +62,17 @@ def run_scan(loaded: LoadedConfig, out: Path, overwrite: bool, listener: Listene
     began = time.perf_counter()
     with ResultFolder(out, overwrite=overwrite) as folder:
         with open_bench(loaded) as bench:
+            ready(bench)
             opened = time.perf_counter()
             rig = find_rig(loaded, bench)
             if isinstance(bench, LatencyBound):
                 bench.use_latency(latency_of(rig))
-            plan = method.first_round(config.scan, bench.projector_size)
+            response = response_of(rig.metadata) if config.scan.correct_response else None
+            light = None if response is None else response.values
+            plan = replace(method.first_round(config.scan, bench.projector_size), response=light)
             with _begin_take(folder.path / "take", loaded, bench, rig, plan, method.rounds) as take:
                 decoder = Decoder(method, config.scan, bench.noise, rig)
-                acquisition = Acquisition(bench, method, config.scan, decoder, take, listener)
+                acquisition = Acquisition(bench, method, config.scan, decoder, take, listener, light)
                 maps = acquisition.run()
             simulated, name = bench.simulated, bench.name
         assert decoder.used_noise is not None
@@ -75,6 +87,7 @@ def run_scan(loaded: LoadedConfig, out: Path, overwrite: bool, listener: Listene
             frames=frames,
             timings_s=timings,
             bench=name,
+            projector=corrected_for(plan.response, rig.metadata),
             warnings=[*loaded.warnings, *acquisition.notes, *decoder.warnings],
         )
         write_result(

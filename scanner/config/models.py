@@ -14,6 +14,7 @@ from pydantic import (
     Discriminator,
     Field,
     PrivateAttr,
+    SerializeAsAny,
     Tag,
     ValidationError,
     ValidationInfo,
@@ -26,6 +27,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from scanner.config.benches import BENCH_GROUP, load_bench_kind
 from scanner.config.problems import ConfigError, FieldPath, show
+from scanner.config.sections import load_section
 from scanner.patterns import Axis, unambiguous_range
 
 if TYPE_CHECKING:
@@ -169,6 +171,11 @@ class ScanSection(_Section):
     mean: float = Field(0.5, ge=0, le=1, description="Mean A of a pattern as a fraction of the projector's full scale.")
     amplitude: float = Field(
         0.5, gt=0, le=0.5, description="Amplitude B of a pattern as a fraction of full scale; A ± B within 0..1."
+    )
+    correct_response: bool = Field(
+        True,
+        description="Correct the patterns for the projector's response where the rig holds a measured one, so that its "
+        "light follows the fringes; false: send the fringes' own grey levels.",
     )
     minimum_modulation_dn: float | None = Field(
         None,
@@ -331,6 +338,22 @@ class Config(_Section):
     scan: ScanSection = Field(default_factory=ScanSection)
     gates: GatesSection = Field(default_factory=GatesSection)
     output: OutputSection = Field(default_factory=OutputSection)
+    calibration: SerializeAsAny[BaseModel] | None = Field(
+        None,
+        description="How `calibrate` makes this bench measurable; null: it is not to be calibrated with this file.",
+    )
+
+    @field_validator("calibration", mode="before")
+    @classmethod
+    def _calibration_has_its_own_model(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is None or isinstance(value, BaseModel):
+            return value
+        try:
+            model = load_section("calibration")
+        except ConfigError as error:
+            _refuse([_refusal((), error.message, error.remedy)])
+            raise
+        return model.model_validate(value, context=info.context)
 
     @field_validator("scan", "gates", "output", mode="before")
     @classmethod

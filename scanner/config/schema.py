@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel
@@ -12,6 +13,7 @@ from pydantic.json_schema import models_json_schema
 from scanner.config.benches import bench_kinds, load_bench_kind
 from scanner.config.models import Config
 from scanner.config.problems import ConfigError
+from scanner.config.sections import load_section
 
 if TYPE_CHECKING:
     from drivers.bench import BenchKind
@@ -55,6 +57,10 @@ def schema_with(kinds: Mapping[str, BenchKind]) -> dict[str, Any]:
     for kind in kinds.values():
         if _has_schema(kind.settings):
             models.append((kind.settings, "validation"))
+    calibration: type[BaseModel] | None = None
+    with suppress(ConfigError):
+        calibration = load_section("calibration")
+        models.append((calibration, "validation"))
     # Made together, models of different packages that share a name keep apart.
     refs, schema = models_json_schema(models)
     definitions = schema["$defs"]
@@ -80,6 +86,9 @@ def schema_with(kinds: Mapping[str, BenchKind]) -> dict[str, Any]:
             "discriminator": {"propertyName": "kind", "mapping": mapping},
         }
     root: dict[str, Any] = definitions.pop(refs[Config, "validation"]["$ref"].removeprefix(_DEFINITIONS))
+    if calibration is not None:
+        field = root["properties"]["calibration"]
+        field["anyOf"] = [refs[calibration, "validation"], {"type": "null"}]
     return {**root, "$defs": definitions}
 
 

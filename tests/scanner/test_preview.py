@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import math
 import os
 import shutil
@@ -17,6 +16,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pytest
+from desktop import Desktop
 from PIL import Image
 from requirements import require
 from scipy.ndimage import gaussian_filter
@@ -382,39 +382,6 @@ def test_bad_pattern_is_refused_by_name(still):
     assert log()[-2:] == ["dark", "closed"]
 
 
-def press(display, letter):
-    """Have the X server send a key press to the first window that is named."""
-    from pyglet.libs.x11 import xlib
-
-    server = xlib.XOpenDisplay(display.encode())
-    root = xlib.XDefaultRootWindow(server)
-    windows = preview_windows(xlib, server, root)
-    assert len(windows) == 1
-    event = xlib.XEvent()
-    key = event.xkey
-    key.display, key.window, key.root, key.time, key.same_screen = server, windows[0], root, xlib.CurrentTime, True
-    key.keycode = xlib.XKeysymToKeycode(server, ord(letter))
-    for key.type, mask in ((xlib.KeyPress, xlib.KeyPressMask), (xlib.KeyRelease, xlib.KeyReleaseMask)):
-        xlib.XSendEvent(server, windows[0], True, mask, ctypes.byref(event))
-    xlib.XSync(server, False)
-    xlib.XCloseDisplay(server)
-
-
-def preview_windows(xlib, server, root):
-    nothing, count = xlib.Window(), ctypes.c_uint()
-    children = ctypes.POINTER(xlib.Window)()
-    xlib.XQueryTree(
-        server, root, ctypes.byref(nothing), ctypes.byref(nothing), ctypes.byref(children), ctypes.byref(count)
-    )
-    found = []
-    for number in range(count.value):
-        name = ctypes.c_char_p()
-        xlib.XFetchName(server, children[number], ctypes.byref(name))
-        if name.value and b"scan preview" in name.value:
-            found.append(children[number])
-    return found
-
-
 def test_window_shows_the_frame_beside_the_projected_part_and_obeys_keys(still, tmp_path):
     from sim_backend.xserver import XServer
 
@@ -449,11 +416,12 @@ def test_window_shows_the_frame_beside_the_projected_part_and_obeys_keys(still, 
         outline[3 * 30 + 1 : 3 * 90 - 1, 3 * 40 + 1 : 3 * 120 - 1] = False
         np.testing.assert_array_equal(seen[~outline], expected[~outline])
 
-        press(server.display, "c")
+        desktop = Desktop(server.display, "scan preview")
+        desktop.press("c")
         wait_until(lambda: (picture()[0][6:18, 12:36] == 255).all())
-        press(server.display, "s")
+        desktop.press("s")
         wait_until(lambda: list(tmp_path.glob("preview-*-frame.png")))
-        press(server.display, "q")
+        desktop.press("q")
         _, errors = process.communicate(timeout=10)
         assert process.returncode == 0, errors
         assert log()[-2:] == ["dark", "closed"]

@@ -1,0 +1,1 @@
+"""What makes a bench measurable: boards, solver, photometry, latency, acceptance, the wizard. Knows the scanner."""
