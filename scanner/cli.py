@@ -229,10 +229,8 @@ def latency(config: ConfigOption, quiet: QuietOption = False, sets: SetOption = 
     from scanner.terminal import Terminal
 
     terminal = Terminal(quiet)
-    with terminal.working() as report:
-        found, rig = measure_latency(
-            load_config(config, overrides(sets, None)), lambda done, total: report(f"step {done} of {total}")
-        )
+    with terminal.counting("step") as count:
+        found, rig = measure_latency(load_config(config, overrides(sets, None)), count)
     terminal.say(
         [
             f"from hand-over to surface: {found.median_s * 1e3:.1f} ms (median), {found.p99_s * 1e3:.1f} ms (p99 of "

@@ -94,6 +94,27 @@ class Terminal:
         with self.console.status("…") as status:
             yield lambda what: status.update(what)
 
+    @contextmanager
+    def counting(self, what: str) -> Iterator[Callable[[int, int], None]]:
+        """Show how many of a number of things are done; gives the function to be told of (done, total)."""
+        told = time.monotonic()
+
+        def count(done: int, total: int) -> None:
+            nonlocal told
+            now = time.monotonic()
+            if self._plain and (now - told >= _PLAIN_EVERY_S or done == total):
+                told = now
+                self.console.print(f"{what} {done} of {total}", markup=False)
+            elif status is not None:
+                status.update(f"{what} {done} of {total}")
+
+        if self._plain:
+            status = None
+            yield count
+            return
+        with self.console.status(what) as status:
+            yield count
+
     def table(self, result: ScanResult, path: Path) -> None:
         """Print the figures of a result and where it lies."""
         counts, quality = result.summary["counts"], result.summary["quality"]

@@ -23,7 +23,7 @@ class _SaverInfo(ctypes.Structure):
 
 
 class Desktop:
-    """A program of its own on the X server ``display``; the methods act on the window with the given title."""
+    """A program of its own on the X server ``display``; the methods act on the window whose title begins so."""
 
     def __init__(self, display, title="projector"):
         xlib.XSetErrorHandler(_ignore)
@@ -47,7 +47,7 @@ class Desktop:
         xlib.XQueryTree(self._display, parent, byref(root), byref(above), byref(children), byref(count))
         for child in [children[number] for number in range(count.value)]:
             name = ctypes.c_char_p()
-            if xlib.XFetchName(self._display, child, byref(name)) and name.value == self._title.encode():
+            if xlib.XFetchName(self._display, child, byref(name)) and name.value.startswith(self._title.encode()):
                 return child
             if found := self._find(child):
                 return found
@@ -77,6 +77,17 @@ class Desktop:
 
     def minimise(self):
         xlib.XIconifyWindow(self._display, self.window(), 0)
+        self._done()
+
+    def press(self, key):
+        """Press and release a key in the window; ``key`` is its X name, such as ``q`` and ``space``."""
+        event = xlib.XEvent()
+        pressed = event.xkey
+        pressed.display, pressed.window, pressed.root = self._display, self.window(), self._root
+        pressed.time, pressed.same_screen = xlib.CurrentTime, True
+        pressed.keycode = xlib.XKeysymToKeycode(self._display, xlib.XStringToKeysym(key.encode()))
+        for pressed.type, mask in ((xlib.KeyPress, xlib.KeyPressMask), (xlib.KeyRelease, xlib.KeyReleaseMask)):
+            xlib.XSendEvent(self._display, pressed.window, True, mask, byref(event))
         self._done()
 
     def move(self, x, y):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import select
 import sys
 import time
@@ -24,6 +25,21 @@ from scanner.preview.live import Live
 _PLAIN_EVERY_S = 1.0
 _HISTOGRAM_COLUMNS = 32
 _BLOCKS = " ▁▂▃▄▅▆▇█"
+_KEYS_SENT = re.compile(rb"\x1b\[[0-9;]*[A-Za-z~]|\x1bO[A-Za-z]|[\x00-\x7f]")
+_KEY_NAMES = {
+    b" ": "space",
+    b"\r": "enter",
+    b"\n": "enter",
+    b"\x1b": "escape",
+    b"\x7f": "backspace",
+    b"\t": "tab",
+    b"\x1b[A": "up",
+    b"\x1b[B": "down",
+    b"\x1b[C": "right",
+    b"\x1b[D": "left",
+    b"\x1b[5~": "pageup",
+    b"\x1b[6~": "pagedown",
+}
 
 
 def reading_line(live: Live) -> str:
@@ -95,34 +111,44 @@ def run_lines(live: Live, console: Console) -> None:
             if time.monotonic() - shown >= _PLAIN_EVERY_S:
                 shown = time.monotonic()
                 console.print(reading_line(live), markup=False)
-    with _keys() as pressed, Redrawn(console=console, auto_refresh=False) as redrawn:
+    with read_keys() as typed, Redrawn(console=console, auto_refresh=False) as redrawn:
         while True:
             live.take()
             redrawn.update(figures(live), refresh=True)
-            key = pressed()
-            if key == "q":
+            keys = typed()
+            if "q" in keys:
                 return
-            if key == "b":
+            if "b" in keys:
                 live.look_at(live.centre)
 
 
 @contextmanager
-def _keys() -> Iterator[Callable[[], str]]:
-    """Read single keys without waiting; gives a function that returns one, or "" where none was pressed."""
+def read_keys() -> Iterator[Callable[[], list[str]]]:
+    """Read single keys of the terminal without waiting; gives a function that returns those typed since its last call.
+
+    Letters and figures are themselves, others have the names that windows give them, such as ``space`` and ``left``.
+    Where the standard input is no terminal there are none.
+    """
     if not sys.stdin.isatty():
-        yield lambda: ""
+        yield list
         return
     import termios
     import tty
 
     before = termios.tcgetattr(sys.stdin)
 
-    def pressed() -> str:
+    def typed() -> list[str]:
         ready, _, _ = select.select([sys.stdin], [], [], 0)
-        return os.read(sys.stdin.fileno(), 1).decode("latin-1") if ready else ""
+        return named_keys(os.read(sys.stdin.fileno(), 1024)) if ready else []
 
     try:
         tty.setcbreak(sys.stdin)
-        yield pressed
+        yield typed
     finally:
         termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+
+def named_keys(read: bytes) -> list[str]:
+    """Names of the keys for which a terminal sent some bytes; a key of several bytes that has no name is left out."""
+    found = [_KEY_NAMES.get(sent, sent.decode("latin-1")) for sent in _KEYS_SENT.findall(read)]
+    return [key.lower() for key in found if not key.startswith("\x1b")]

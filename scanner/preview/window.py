@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import TracebackType
+from typing import Any, NamedTuple, Self
 
 import cv2
 from PIL import Image
@@ -71,8 +71,16 @@ def projected_areas(document: Mapping[str, Any]) -> list[Area]:
     return found
 
 
-def operator_area(taken: Sequence[Area]) -> tuple[Any, Area] | None:
-    """The largest part of the desktop that nothing is projected on, and the pyglet screen it is on; None for none."""
+def operator_area(taken: Sequence[Area], least: tuple[int, int] = LEAST_SIZE) -> tuple[Any, Area] | None:
+    """The largest part of the desktop that nothing is projected on, and the pyglet screen it is on; None for none.
+
+    Parameters
+    ----------
+    taken
+        What is projected on; see `projected_areas`.
+    least
+        (width, height) that such a part has at least, px.
+    """
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         return None
     try:
@@ -87,7 +95,7 @@ def operator_area(taken: Sequence[Area]) -> tuple[Any, Area] | None:
         areas = [Area(screen.x, screen.y, screen.width, screen.height)]
         for other in taken:
             areas = [piece for area in areas for piece in area.without(other)]
-        free += [(screen, a) for a in areas if a.width >= LEAST_SIZE[0] and a.height >= LEAST_SIZE[1]]
+        free += [(screen, a) for a in areas if a.width >= least[0] and a.height >= least[1]]
     return max(free, key=lambda found: found[1].width * found[1].height, default=None)
 
 
@@ -97,6 +105,144 @@ def save(live: Live, picture: Picture, path: Path) -> Path:
     frame = path.with_name(f"{path.stem}-frame.png")
     cv2.imwrite(str(frame), live.frame)
     return frame
+
+
+class PictureWindow:
+    """A window on the operator's screen that shows pictures and collects keys and clicks; a context manager.
+
+    Parameters
+    ----------
+    screen, area
+        The pyglet screen to be on, and the part of the desktop to stay in; see `operator_area`.
+    caption
+        Title of the window.
+    size
+        (width, height) it begins with, px; None takes most of the area.
+    least
+        (width, height) to which it can be made smaller, px.
+    """
+
+    def __init__(
+        self,
+        screen: Any,
+        area: Area,
+        caption: str,
+        size: tuple[int, int] | None = None,
+        least: tuple[int, int] = LEAST_SIZE,
+    ) -> None:
+        self._screen = screen
+        self._area = area
+        self._caption = caption
+        self._first_size = size or most_of(area)
+        self._least = least
+        self._window: Any = None
+        self._texture: Any = None
+        self._placed_by = 0.0
+        self._keys: list[str] = []
+        self._clicks: list[tuple[float, float]] = []
+
+    def __enter__(self) -> Self:
+        import pyglet
+
+        self._window = pyglet.window.Window(
+            *self._first_size, caption=self._caption, resizable=True, screen=self._screen, vsync=False, visible=False
+        )
+        try:
+            self._window.push_handlers(self)
+            self._window.set_minimum_size(*self._least)
+            self._place()
+            self._window.set_visible(True)
+            self._placed_by = time.monotonic() + _PLACING_S
+        except BaseException:
+            self._window.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._window.close()
+        self._window = self._texture = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the pictures that fill it now, px."""
+        width, height = self._window.get_framebuffer_size()
+        return int(width), int(height)
+
+    def show(self, picture: Picture) -> None:
+        """Show a picture (H, W, 3) over the whole window, and see what the operator did."""
+        import pyglet
+
+        window, (height, width) = self._window, picture.shape[:2]
+        window.switch_to()
+        if self._texture is None or (self._texture.width, self._texture.height) != (width, height):
+            self._texture = pyglet.image.Texture.create(width, height)
+        # The array's first row is the top, an OpenGL picture's the bottom: a negative pitch turns it.
+        data = pyglet.image.ImageData(width, height, "RGB", picture.tobytes(), pitch=-3 * width)
+        self._texture.blit_into(data, 0, 0, 0)
+        window.clear()
+        self._texture.blit(0, 0, width=window.width, height=window.height)
+        window.flip()
+        window.dispatch_events()
+        if time.monotonic() < self._placed_by:
+            self._place()
+
+    def pressed(self) -> list[str]:
+        """Keys pressed since the last call, in order.
+
+        Letters and figures are themselves, others have names such as ``space``, ``escape`` and ``left``; ``close`` says
+        that the operator wants the window closed.
+        """
+        found, self._keys = self._keys, []
+        return found
+
+    def clicked(self) -> list[tuple[float, float]]:
+        """(column, row) of the picture that were clicked since the last call."""
+        found, self._clicks = self._clicks, []
+        return found
+
+    def ring(self, times: int = 1) -> None:
+        """Ring the bell of the screen, where it has one."""
+        display = getattr(getattr(self._window, "display", None), "_display", None)
+        if display is not None and sys.platform.startswith("linux"):
+            from pyglet.libs.x11 import xlib
+
+            for _ in range(times):
+                xlib.XBell(display, 0)
+            xlib.XFlush(display)
+
+    def _place(self) -> None:
+        """Move the window to the middle of its area unless it is inside; window managers put new ones elsewhere."""
+        window, area = self._window, self._area
+        x, y = window.get_location()
+        inside = area.x <= x and x + window.width <= area.x + area.width
+        if not (inside and area.y <= y and y + window.height <= area.y + area.height):
+            left, top = (area.width - window.width) // 2, (area.height - window.height) // 2
+            window.set_location(area.x + left, area.y + top)
+
+    def on_key_press(self, symbol: int, modifiers: int) -> bool:
+        """Keep the key."""
+        from pyglet.window import key
+
+        self._keys.append(key.symbol_string(symbol).removeprefix("_").lower())
+        return True  # pyglet's own Escape does not ask whether the projector is dark
+
+    def on_mouse_press(self, x: int, y: int, button: int, modifiers: int) -> None:
+        """Keep where the operator points."""
+        width, height = self.size
+        scale = width / self._window.width
+        self._clicks.append((x * scale, height - y * scale))
+
+    def on_close(self) -> bool:
+        """Say so; whoever shows pictures ends."""
+        self._keys.append("close")
+        return True
+
+
+def most_of(area: Area) -> tuple[int, int]:
+    """(width, height) of a new window that leaves something of ``area`` to see around it, px."""
+    return round(area.width * _SHARE_OF_AREA), round(area.height * _SHARE_OF_AREA)
 
 
 class PreviewWindow:
@@ -116,111 +262,49 @@ class PreviewWindow:
 
     def __init__(self, live: Live, screen: Any, area: Area, *, coloured: bool = True, folder: Path = Path()) -> None:
         self.live = live
-        self._screen = screen
-        self._area = area
         self.coloured = coloured
         self.folder = folder
         self.frozen = False
         self._note = ""
-        self._texture: Any = None
-        self._open = False
-        self._placed_by = 0.0
-        self._size = (1, 1)
-        self._pixels_per_unit = 1.0
+        size = most_of(area)
+        needed = max(picture_size(live.bench.frame_format, size)[1], PANEL_PX[1])
+        self._window = PictureWindow(screen, area, f"scan preview – {live.bench.name}", (size[0], min(size[1], needed)))
 
     def run(self) -> None:
         """Take and show frames until the operator quits."""
-        with self._window() as window:
-            while self._open:
+        with self._window as window:
+            while True:
                 if not self.frozen:
                     self.live.take()
-                self._show(window)
-                window.dispatch_events()
-                if time.monotonic() < self._placed_by:
-                    self._place(window)
+                window.show(self._draw(window.size))
+                for click in window.clicked():
+                    self._look_at(click)
+                for key in window.pressed():
+                    if key in ("q", "escape", "close"):
+                        return
+                    self._obey(key)
                 if self.frozen:
                     time.sleep(_FROZEN_S)
-
-    @contextlib.contextmanager
-    def _window(self) -> Iterator[Any]:
-        import pyglet
-
-        area = self._area
-        size = round(area.width * _SHARE_OF_AREA), round(area.height * _SHARE_OF_AREA)
-        needed = max(picture_size(self.live.bench.frame_format, size)[1], PANEL_PX[1])
-        size = size[0], min(size[1], needed)
-        window = pyglet.window.Window(
-            *size,
-            caption=f"scan preview – {self.live.bench.name}",
-            resizable=True,
-            screen=self._screen,
-            vsync=False,
-            visible=False,
-        )
-        try:
-            window.push_handlers(self)
-            window.set_minimum_size(*LEAST_SIZE)
-            self._place(window)
-            window.set_visible(True)
-            self._placed_by = time.monotonic() + _PLACING_S
-            self._open = True
-            yield window
-        finally:
-            window.close()
-
-    def _place(self, window: Any) -> None:
-        """Move the window to the middle of its area unless it is inside; window managers put new ones elsewhere."""
-        area, (x, y) = self._area, window.get_location()
-        inside = area.x <= x and x + window.width <= area.x + area.width
-        if not (inside and area.y <= y and y + window.height <= area.y + area.height):
-            left, top = (area.width - window.width) // 2, (area.height - window.height) // 2
-            window.set_location(area.x + left, area.y + top)
-
-    def _show(self, window: Any) -> None:
-        import pyglet
-
-        self._size = size = window.get_framebuffer_size()
-        self._pixels_per_unit = size[0] / window.width
-        picture = self._draw(size)
-        window.switch_to()
-        if self._texture is None or (self._texture.width, self._texture.height) != size:
-            self._texture = pyglet.image.Texture.create(*size)
-        # The array's first row is the top, an OpenGL picture's the bottom: a negative pitch turns it.
-        data = pyglet.image.ImageData(size[0], size[1], "RGB", picture.tobytes(), pitch=-3 * size[0])
-        self._texture.blit_into(data, 0, 0, 0)
-        window.clear()
-        self._texture.blit(0, 0, width=window.width, height=window.height)
-        window.flip()
 
     def _draw(self, size: tuple[int, int]) -> Picture:
         note = "frozen: space goes on" if self.frozen else self._note
         return draw(self.live, size, coloured=self.coloured, note=note)
 
-    def on_key_press(self, symbol: int, modifiers: int) -> bool:
+    def _obey(self, key: str) -> None:
         """Do what the key says."""
-        from pyglet.window import key
-
-        if symbol in (key.Q, key.ESCAPE):
-            self._open = False
-        elif symbol == key.SPACE:
+        if key == "space":
             self.frozen = not self.frozen
-        elif symbol == key.C:
+        elif key == "c":
             self.coloured = not self.coloured
-        elif symbol == key.B:
+        elif key == "b":
             self.live.look_at(self.live.centre)
-        elif symbol == key.S:
+        elif key == "s":
             path = self.folder / f"preview-{datetime.now():%Y%m%d-%H%M%S}.png"
             save(self.live, self._draw((1280, 800)), path)
             self._note = f"saved {path.name}"
-        return True  # pyglet's own Escape does not ask whether the projector is dark
 
-    def on_mouse_press(self, x: int, y: int, button: int, modifiers: int) -> None:
+    def _look_at(self, place: tuple[float, float]) -> None:
         """Look where the operator points."""
-        width, height = picture_size(self.live.bench.frame_format, self._size)
-        column, row = x * self._pixels_per_unit, self._size[1] - y * self._pixels_per_unit
-        if column < width and row < height:
-            self.live.look_at((column / width, row / height))
-
-    def on_close(self) -> None:
-        """End the loop; the window is closed behind it."""
-        self._open = False
+        width, height = picture_size(self.live.bench.frame_format, self._window.size)
+        if place[0] < width and place[1] < height:
+            self.live.look_at((place[0] / width, place[1] / height))

@@ -943,7 +943,9 @@ def test_the_demo_is_valid_and_documented_line_by_line(monkeypatch: pytest.Monke
         assert list(document[section]) == list(model.model_fields)
     lines = [line for line in path.read_text().splitlines() if line.strip() and not line.lstrip().startswith("#")]
     bare = [line.strip() for line in lines if "#" not in line]
-    assert all(re.match(r"(\w+_)?height|camera:|projector:|mirror_height|farthest|pitch|yaw|offset", line) for line in bare), bare
+    assert all(
+        re.match(r"(\w+_)?height|camera:|projector:|mirror_height|farthest|pitch|yaw|offset", line) for line in bare
+    ), bare
 
 
 # --- being light

@@ -1,0 +1,118 @@
+"""Acceptance: scans of calibrated artefacts with the rig that was found, their figures, and the certificate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.acceptance.artefacts import PlaneBesideMirror, SphereBesideMirror
+from calibration.acceptance.evaluation import Evaluation, evaluate
+from calibration.acceptance.figures import Verdict
+from calibration.acceptance.interreflection import evaluate_beside_mirror
+from calibration.certificate import Certificate
+from calibration.folder import CERTIFICATE, CERTIFICATE_DATA
+from calibration.operators import Answer
+from calibration.settings import PlacedArtefact
+from calibration.work import StoppedError, Work
+from scanner.folder import read_result
+from scanner.result import Maps, ScanResult
+from scanner.rig import Rig
+from scanner.session import run_scan
+
+STEP = "acceptance"
+
+
+def run(work: Work, rig_path: Path) -> Verdict:
+    """Scan every artefact of the bench file with the rig at ``rig_path`` and write the certificate.
+
+    A scan that is there already is not made again, unless it was made with another rig.
+
+    Raises
+    ------
+    StoppedError
+        The operator has left.
+    """
+    rig = Rig.load(rig_path)
+    rng = np.random.default_rng(0)
+    evaluations, simulated, bench, versions = [], False, "", {}
+    wanted = work.settings.acceptance.artefacts
+    for number, placed in enumerate(wanted, 1):
+        title = f"{number:02d}-{placed.artefact.kind}"
+        work.terminal.say([f"{STEP}: artefact {number} of {len(wanted)}, {placed.artefact.title}"])
+        scans = _scans(work, title, placed, rig, rig_path)
+        evaluations.append(_evaluated(placed, [scan.maps for scan in scans], rig, rng))
+        simulated |= any(scan.simulated for scan in scans)
+        bench, versions = scans[0].summary["bench"], scans[0].summary["versions"]
+    certificate = Certificate(
+        bench=bench,
+        simulated=simulated,
+        evaluations=evaluations,
+        limits=work.settings.acceptance.limits,
+        rig=rig,
+        calibration=rig.metadata.get("calibration", {}),
+        conditions={
+            "method": work.loaded.config.scan.method,
+            "temperature, °C": work.settings.temperature_celsius,
+            "notes": work.settings.notes,
+        },
+        versions=versions,
+    )
+    page = work.folder.path / CERTIFICATE
+    certificate.write(work.folder.path / CERTIFICATE_DATA, page)
+    verdict = certificate.verdict
+    figures = [
+        f"{f.artefact}, {f.quantity.label}: "
+        + ("not measured" if f.value_mm is None else f"{f.value_mm:.4f} ± {f.expanded_mm:.4f} mm")
+        + ("" if f.limit_mm is None else f", limit {f.limit_mm:g} mm: {f.verdict}")
+        for f in certificate.figures
+    ]
+    work.report(STEP, {"verdict": str(verdict)}, [], [*figures, f"{verdict}; the certificate is {page}"])
+    return verdict
+
+
+def _scans(work: Work, title: str, placed: PlacedArtefact, rig: Rig, rig_path: Path) -> list[ScanResult]:
+    artefact, pose = placed.artefact, placed.pose
+    if isinstance(artefact, PlaneBesideMirror | SphereBesideMirror):
+        scenes = {
+            f"{title}-mirror": (artefact.title, artefact.scene(pose)),
+            f"{title}-removed": (
+                f"{artefact.title}: take the mirror away and touch nothing else",
+                artefact.scene(pose, with_mirror=False),
+            ),
+        }
+    else:
+        scenes = {f"{title}-{i + 1}": (artefact.title, artefact.scene(pose)) for i in range(placed.repeats)}
+    return [
+        _scan(work, name, what, scene, rig, rig_path, repeat)
+        for repeat, (name, (what, scene)) in enumerate(scenes.items())
+    ]
+
+
+def _scan(
+    work: Work, name: str, what: str, scene: Mapping[str, Any], rig: Rig, rig_path: Path, repeat: int
+) -> ScanResult:
+    out = work.folder.path / "acceptance" / name
+    if (out / "result.json").is_file() and Rig.load(out / "rig.json").to_json() == rig.to_json():
+        work.terminal.say([f"  {name} is there already"])
+        return read_result(out)
+
+    def ready(bench: Any) -> None:
+        if work.operator.place(bench, what, scene) is Answer.STOP:
+            raise StoppedError("stopped by the operator", "The same command goes on from here.")
+
+    changes: dict[str, Any] = {"rig": str(rig_path.resolve())}
+    if repeat and hasattr(work.loaded.bench_settings, "seed"):
+        # A simulated bench that is opened again has the same noise again, unless it is told otherwise.
+        changes["bench__seed"] = work.loaded.bench_settings.seed + repeat
+    result, _ = run_scan(work.configured(**changes), out, out.exists(), work.terminal, ready)
+    return result
+
+
+def _evaluated(placed: PlacedArtefact, maps: list[Maps], rig: Rig, rng: np.random.Generator) -> Evaluation:
+    artefact = placed.artefact
+    if isinstance(artefact, PlaneBesideMirror | SphereBesideMirror):
+        return evaluate_beside_mirror(artefact, maps[0], maps[1], rig, rng)
+    return evaluate(artefact, maps, rig, rng, temperature_C=placed.temperature_celsius)

@@ -1,0 +1,228 @@
+"""Geometry: the board in many poses, and the rig that explains them all."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from calibration.bundle import calibrate_rig
+from calibration.capture import capture_fringes
+from calibration.correspondence import observe
+from calibration.detection import BoardNotFoundError, find_board
+from calibration.diagnosis import Expectation, Fringes
+from calibration.export import export_opencv
+from calibration.folder import OPENCV_RIG, RIG
+from calibration.guide.guidance import Step
+from calibration.observations import BoardPose, PoseObservation
+from calibration.operators import Answer, Request
+from calibration.planning import first_poses, grid, next_pose
+from calibration.planning.glimpse import guessed_lens
+from calibration.solver.refusal import CalibrationError
+from calibration.solver.result import Calibration
+from calibration.work import StepFailedError, StoppedError, Work
+from drivers import Bench
+from scanner.acquisition import AcquisitionError, ExposureError
+from scanner.config import ScanSection
+from scanner.response import PROJECTOR_RESPONSE
+from scanner.session import DISPLAY_LATENCY
+
+STEP: Step = "geometry"
+
+_BEGINNING = 4
+"""Poses by a fixed scheme before the covariance of what is known chooses."""
+
+_PERIODS = (16.0, 80.0)
+"""Fringes that are fine enough for a board's small squares, px; a third spans the projector."""
+
+
+def run(work: Work) -> None:
+    """Take the poses that are still missing, then solve and keep the rig.
+
+    Raises
+    ------
+    StoppedError
+        The operator has left; the poses so far are kept.
+    StepFailedError
+        No board was found again and again, or the rig is refused, with the reasons.
+    """
+    wanted = work.settings.geometry.poses
+    misses = 0
+    with work.bench() as bench:
+        camera_size, projector_size = _sizes(bench)
+        while len(poses := work.folder.poses()) < wanted:
+            calibration = _solved(work, poses, camera_size, projector_size)
+            request = _request(work, poses, calibration, camera_size)
+            answer = work.operator.hold_board(bench, work.board, request)
+            if answer is Answer.STOP:
+                raise StoppedError(
+                    f"stopped by the operator with {len(poses)} of {wanted} poses",
+                    "The same command goes on from here.",
+                )
+            if answer is Answer.BACK and poses:
+                work.folder.drop_pose(poses[-1].name)
+            elif answer is Answer.TAKE:
+                misses = 0 if _take(work, bench, request) else misses + 1
+            if misses > wanted:
+                raise StepFailedError(
+                    f"geometry: the board was not seen in {misses} poses in turn",
+                    "Look at the takes of these poses: is the whole board lit and in the picture?",
+                )
+    _finish(work, poses, camera_size, projector_size)
+
+
+def fringes(work: Work, projector_size: tuple[int, int]) -> ScanSection:
+    """What is projected on the board."""
+    periods = {
+        axis: [p for p in _PERIODS if p < extent] + [float(extent)]
+        for axis, extent in zip(("x", "y"), projector_size, strict=True)
+    }
+    wanted = work.loaded.config.scan.model_dump(mode="json") | {
+        "method": "tps",
+        "steps": work.settings.geometry.steps,
+        "frequencies_per_px": None,
+        "periods_px": {axis: periods[axis] for axis in work.loaded.config.scan.axes},
+    }
+    return ScanSection.model_validate_json(json.dumps(wanted))
+
+
+def take_pose(work: Work, bench: Bench, name: str, **notes: object) -> PoseObservation:
+    """Photograph fringes on the board as it is held, and find its points in camera and projector.
+
+    Raises
+    ------
+    BoardNotFoundError, AcquisitionError, ExposureError
+        The board is not seen, it moved, or it is too bright there.
+    """
+    scan = fringes(work, bench.projector_size)
+    maps, noise = capture_fringes(
+        bench, scan, work.response, work.folder.new_take(name), work.occasion(STEP, **notes), work.terminal
+    )
+    # The mean of all fringes is a picture in steady light, with the noise of one over the root of their number.
+    level = float(np.quantile(maps.brightness, 0.9))
+    frames = scan.steps * sum(len(scan.frequencies(axis) or ()) for axis in scan.axes)
+    view = find_board(maps.brightness, work.board, math.sqrt(float(noise.variance(level)) / frames))
+    return observe(name, view, work.board, maps.x_p, maps.sigma_x, maps.y_p, maps.sigma_y, maps.modulation, maps.valid)
+
+
+def _take(work: Work, bench: Bench, request: Request) -> bool:
+    name = work.folder.next_pose()
+    try:
+        observation = take_pose(work, bench, name, asked=vars(request.pose))
+    except (BoardNotFoundError, AcquisitionError, ExposureError) as error:
+        work.terminal.note(f"{name} does not count: {error.message}. {error.remedy}")
+        return False
+    work.folder.add_pose(name, observation)
+    seen = np.isfinite(observation.projector).any(axis=1).sum()
+    work.terminal.say([f"{name}: {len(observation.ids)} points, {seen} of them in the projector's picture as well"])
+    return True
+
+
+def _sizes(bench: Bench) -> tuple[tuple[int, int], tuple[int, int]]:
+    fmt = bench.frame_format
+    return (fmt.width, fmt.height), bench.projector_size
+
+
+def _request(
+    work: Work, poses: list[PoseObservation], calibration: Calibration | None, camera_size: tuple[int, int]
+) -> Request:
+    settings = work.settings.geometry
+    middle = (settings.nearest_mm + settings.farthest_mm) / 2
+    title = f"pose {len(poses) + 1} of {settings.poses}"
+    if not poses:
+        return Request(STEP, title, "in the middle of the picture, facing the camera", BoardPose(middle))
+    if calibration is None or len(poses) < _BEGINNING:
+        lens = guessed_lens(poses[0].points_board, poses[0].camera, middle, camera_size)
+        scheme = first_poses(lens, work.board.points)
+        pose = scheme[len(poses) % len(scheme)]
+        return Request(STEP, title, "another tilt", _within(work, pose))
+    pool = [_within(work, p) for p in grid(calibration.rig.camera, work.board.points, middle)]
+    found = next_pose(calibration, work.board.points, pool)
+    if found is None:
+        return Request(STEP, title, "in the middle of the picture, facing the camera", BoardPose(middle))
+    return Request(STEP, title, f"{found.reason}", found.pose, f"lowers the uncertainty by {100 * found.gain:.0f} %")
+
+
+def _within(work: Work, pose: BoardPose) -> BoardPose:
+    """The pose, brought into the range of distances and tilts that the bench file gives."""
+    settings = work.settings.geometry
+    distance = float(np.clip(pose.distance_mm, settings.nearest_mm, settings.farthest_mm))
+    ratio = distance / pose.distance_mm
+    tilt = max(abs(pose.yaw_deg), abs(pose.pitch_deg), 1e-9)
+    turned = min(1.0, settings.tilt_deg / tilt)
+    return replace(
+        pose,
+        distance_mm=distance,
+        offset_x_mm=pose.offset_x_mm * ratio,
+        offset_y_mm=pose.offset_y_mm * ratio,
+        yaw_deg=pose.yaw_deg * turned,
+        pitch_deg=pose.pitch_deg * turned,
+    )
+
+
+def _solved(
+    work: Work, poses: list[PoseObservation], camera_size: tuple[int, int], projector_size: tuple[int, int]
+) -> Calibration | None:
+    """The calibration of the poses so far; None where they do not make one yet."""
+    if len(poses) < _BEGINNING:
+        return None
+    try:
+        return calibrate_rig(poses, camera_size, projector_size)
+    except CalibrationError:
+        return None
+
+
+def _finish(
+    work: Work, poses: list[PoseObservation], camera_size: tuple[int, int], projector_size: tuple[int, int]
+) -> None:
+    settings = work.settings
+    steps = settings.geometry.steps
+    try:
+        found = calibrate_rig(
+            poses,
+            camera_size,
+            projector_size,
+            bend=settings.geometry.bend,
+            expected=Expectation(baseline_mm=settings.expected.baseline_mm, tolerance=settings.expected.tolerance),
+            fringes=Fringes(1 / _PERIODS[0], 1 / _PERIODS[0], steps),
+            validity={
+                "board": work.board.name,
+                "temperature_celsius": settings.temperature_celsius,
+                "notes": settings.notes,
+                "exposure": work.folder.finding("exposure"),
+                "focus": work.folder.finding("focus"),
+            },
+        )
+    except CalibrationError as error:
+        raise StepFailedError.of(STEP, error.findings) from error
+    rig = found.rig
+    metadata = dict(rig.metadata)
+    if work.latency is not None:
+        metadata[DISPLAY_LATENCY] = work.latency.to_json()
+    if work.response is not None:
+        metadata[PROJECTOR_RESPONSE] = work.response.to_json()
+    response = work.folder.finding("response")
+    if response is not None:
+        metadata["mtf"] = response["mtf"]
+    rig = replace(rig, metadata=metadata)
+    lines = [
+        f"{len(poses) - len(found.dropped)} poses"
+        + (f", {', '.join(found.dropped)} left out" if found.dropped else ""),
+        f"reprojection error {found.rms_camera:.4f} px in the camera (expected {found.expected_camera:.4f}), "
+        f"{found.rms_projector:.4f} px in the projector (expected {found.expected_projector:.4f})",
+        *(_line(found, lens) for lens in ("camera", "projector")),
+        f"baseline {found.baseline[0]:.3f} ± {found.baseline[1]:.3f} mm",
+    ]
+    if found.usable:
+        rig.save(work.folder.path / RIG)
+        export_opencv(rig, work.folder.path / OPENCV_RIG)
+        lines.append(f"the rig is {work.folder.path / RIG}; name it in the bench file as `rig:`")
+    work.report(STEP, {"rms_px": {"camera": found.rms_camera, "projector": found.rms_projector}}, found.findings, lines)
+
+
+def _line(found: Calibration, lens: str) -> str:
+    focal, sigma = found.value(f"{lens}.fx")
+    terms = getattr(found.terms, lens)
+    return f"{lens}: focal length {focal:.2f} ± {sigma:.2f} px, distortion {', '.join(terms) or 'none'}"
