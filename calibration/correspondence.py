@@ -67,9 +67,9 @@ def observe(
 
     Returns
     -------
-    The observation. ``projector_sigma`` is that of the coordinate at the point as it was found: the fit's own, times
-    max(1, √(χ²/ν)), and the share that the camera's uncertainty of the point moves it by. NaN where fewer than 24 lit
-    pixels surround a point, or lie to one side of it only.
+    The observation. ``projector_sigma`` is that of the coordinate at the very place where the point was found: the
+    fit's own, times max(1, √(χ²/ν)); how the coordinate moves with that place is ``projector_gradient``. NaN where
+    fewer than 24 lit pixels surround a point, or lie to one side of it only.
 
     Raises
     ------
@@ -80,6 +80,7 @@ def observe(
     plane = PlaneMap.fitted(board.points[view.ids, :2], view.xy, 1 / view.sigma) if len(view.ids) >= 4 else None
     projector = np.full((len(view.ids), 2), np.nan)
     sigma = np.full((len(view.ids), 2), np.nan)
+    gradient = np.zeros((len(view.ids), 2, 2))
     if plane is not None:
         paper = _white_paper(plane, board, view, modulation.shape)
         first, _ = plane.expanded(board.points[view.ids, :2], board.pitch_mm / 10)
@@ -88,7 +89,7 @@ def observe(
             lit &= valid
         for axis, maps in enumerate(axes):
             if maps is not None:
-                projector[:, axis], sigma[:, axis] = _at_points(view, board, first, *maps, lit)
+                projector[:, axis], sigma[:, axis], gradient[:, axis] = _at_points(view, board, first, *maps, lit)
     return PoseObservation(
         name=name,
         ids=view.ids,
@@ -97,6 +98,7 @@ def observe(
         camera_sigma=np.repeat(view.sigma[:, None], 2, axis=1),
         projector=projector,
         projector_sigma=sigma,
+        projector_gradient=gradient,
     )
 
 
@@ -172,15 +174,16 @@ def _lit(paper: Mask, modulation: NDArray[np.float32], pitch_px: float) -> Mask:
 
 def _at_points(
     view: BoardView, board: Board, first: Array, u: NDArray[np.float32], sigma: NDArray[np.float32], lit: Mask
-) -> tuple[Array, Array]:
-    """Coordinates (n,) and standard deviations (n,) of one axis at the points."""
+) -> tuple[Array, Array, Array]:
+    """Coordinates (n,), standard deviations (n,) and gradients (n, 2) of one axis at the points."""
     coordinate, deviation = np.full(len(view.ids), np.nan), np.full(len(view.ids), np.nan)
+    gradient = np.zeros((len(view.ids), 2))
     rows, columns = np.nonzero(lit & np.isfinite(u) & (sigma > 0) & np.isfinite(sigma))
     if len(rows) < _FEWEST_PIXELS:
-        return coordinate, deviation
+        return coordinate, deviation, gradient
     surface = _Surface.fitted(columns, rows, u[rows, columns], sigma[rows, columns])
     if surface is None:
-        return coordinate, deviation
+        return coordinate, deviation, gradient
     rest = u[rows, columns] - surface(columns, rows)
     whole = np.full(u.shape, np.nan)
     whole[rows, columns] = rest
@@ -198,10 +201,8 @@ def _at_points(
         found = _local(dx, dy, whole[window][row, column], sigma[window][row, column])
         if found is not None:
             offset, variance, slope = found
-            coordinate[i] = at_points[i] + offset
-            moved = np.sum((slopes[i] + slope) ** 2) * view.sigma[i] ** 2
-            deviation[i] = np.sqrt(variance + moved)
-    return coordinate, deviation
+            coordinate[i], deviation[i], gradient[i] = at_points[i] + offset, np.sqrt(variance), slopes[i] + slope
+    return coordinate, deviation, gradient
 
 
 def _local(dx: Array, dy: Array, rest: Array, sigma: Array) -> tuple[float, float, Array] | None:

@@ -296,7 +296,9 @@ def _epipolar_noise(rig: Rig, data: Measurements, scales: Array) -> Array:
             scales[lens] * np.sqrt(np.divide(1.0, known, out=np.zeros_like(known), where=known > 0).mean(1))
         )
 
-    return np.hypot(sigma(1), sigma(0) * _focal(rig.projector) / _focal(rig.camera))
+    # A coordinate that was read at the camera's point makes a true pair with it, whatever that point's error.
+    apart = ~data.gradient.any(axis=(1, 2))
+    return np.hypot(sigma(1), apart * sigma(0) * _focal(rig.projector) / _focal(rig.camera))
 
 
 def _focal(lens: Lens) -> float:

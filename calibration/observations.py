@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,10 @@ class PoseObservation:
     projector, projector_sigma
         (n, 2) projector px (column, row) and their standard deviations; NaN where a coordinate was not measured, a
         whole column of it with one-axis plans.
+    projector_gradient
+        (n, 2, 2), derivatives of column and row after the camera's x and y. A coordinate that was read at the place
+        where the camera has found a point errs with it, by this times the camera's error, beside ``projector_sigma``.
+        0 where the two were measured apart.
     """
 
     name: str
@@ -56,6 +60,7 @@ class PoseObservation:
     camera_sigma: Array
     projector: Array
     projector_sigma: Array
+    projector_gradient: Array = field(default_factory=lambda: np.zeros((2, 2)))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from calibration.boards import Board
-from calibration.guide.guidance import Step
+from calibration.guide.guidance import Bar, Curve, Step
 from calibration.observations import BoardPose
 from calibration.settings import HandSettings
 from drivers import Bench, OperatorError, Presenter
@@ -31,6 +31,12 @@ class UnattendedError(OperatorError):
     """Something needs a hand, and there is none."""
 
 
+class StoppedError(OperatorError):
+    """The operator has left; everything that was taken is kept."""
+
+    exit_code = 130
+
+
 @dataclass(frozen=True)
 class Request:
     """What the operator is asked to hold, and why there.
@@ -42,22 +48,53 @@ class Request:
     title
         Such as ``pose 4 of 10``.
     instruction
-        In words.
+        What to do, in one sentence.
     pose
         Where.
+    exact
+        Whether it matters that the board is held just there; otherwise it is enough that it is seen.
     reason
         What is gained by it.
+    bars
+        How well is known by now what the step is to find.
     """
 
     step: Step
     title: str
     instruction: str
     pose: BoardPose
+    exact: bool = False
     reason: str = ""
+    bars: tuple[Bar, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a step has found, for the operator to look at.
+
+    Parameters
+    ----------
+    step
+        Of the calibration.
+    lines
+        The figures in words.
+    notes
+        Warnings, each with what to do.
+    curve
+        What was measured.
+    bars
+        How well is known what was to be found.
+    """
+
+    step: Step
+    lines: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    curve: Curve | None = None
+    bars: tuple[Bar, ...] = ()
 
 
 class Operator(Protocol):
-    """Does by hand what a calibration asks for."""
+    """Does by hand what a calibration asks for, and is told how it goes."""
 
     def hold_board(self, bench: Bench, board: Board, request: Request) -> Answer:
         """Have the board held before the bench; returns when it stands still there, or the operator wants else."""
@@ -69,6 +106,34 @@ class Operator(Protocol):
 
     def place(self, bench: Bench, what: str, scene: Mapping[str, Any]) -> Answer:
         """Have an artefact placed: ``what`` in words, ``scene`` as the document that a `drivers.Presenter` takes."""
+        ...
+
+    def wait(self, what: str, done: int, total: int) -> None:
+        """Be told that ``done`` of ``total`` are through, ``what`` in words; nothing may move meanwhile.
+
+        Raises
+        ------
+        StoppedError
+            The operator has left.
+        """
+        ...
+
+    def tell(self, good: bool, text: str) -> None:
+        """Be told whether what was just taken counts."""
+        ...
+
+    def learn(self, outcome: Outcome) -> None:
+        """Look at what a step has found; returns when the operator has seen it.
+
+        Raises
+        ------
+        StoppedError
+            The operator has left.
+        """
+        ...
+
+    def again(self, step: Step, error: OperatorError, what: str) -> bool:
+        """Whether, after a step failed, the operator has mended it and wants ``what``; nobody does without a person."""
         ...
 
 
@@ -113,6 +178,19 @@ class ScriptedOperator:
         self._held = scene
         self.keep(bench)
         return Answer.TAKE
+
+    def wait(self, what: str, done: int, total: int) -> None:
+        """Nobody waits."""
+
+    def tell(self, good: bool, text: str) -> None:
+        """Nobody listens; the terminal has said it."""
+
+    def learn(self, outcome: Outcome) -> None:
+        """Nobody looks."""
+
+    def again(self, step: Step, error: OperatorError, what: str) -> bool:
+        """Nobody mends anything."""
+        return False
 
 
 def _presenter(bench: Bench) -> Presenter:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -10,22 +10,17 @@ from typing import Any
 from calibration.boards import Board
 from calibration.capture import Occasion
 from calibration.folder import CalibrationFolder
-from calibration.guide.guidance import Step
+from calibration.guide.guidance import Bar, Curve, Step
 from calibration.observations import BoardPose, Finding
-from calibration.operators import Answer, Operator, Request
+from calibration.operators import Answer, Operator, Outcome, Request, StoppedError
 from calibration.settings import CalibrationSettings
 from drivers import Bench, DisplayLatency, LatencyBound, OperatorError
+from scanner.acquisition import Listener, Progress, ScanState
 from scanner.config import LoadedConfig, load_config, open_bench
 from scanner.response import ProjectorResponse
 from scanner.terminal import Terminal
 
 _EXPOSURE = "bench.camera.exposure_us"
-
-
-class StoppedError(OperatorError):
-    """The operator has left; everything that was taken is kept."""
-
-    exit_code = 130
 
 
 class StepFailedError(OperatorError):
@@ -113,7 +108,26 @@ class Work:
         """For the manifest of a take."""
         return Occasion(step, self.loaded.config.model_dump(mode="json"), notes)
 
-    def hold_facing(self, bench: Bench, step: Step, why: str, *, nearest: bool = False) -> None:
+    @contextmanager
+    def counting(self, what: str) -> Iterator[Callable[[int, int], None]]:
+        """Show terminal and operator how many of a number of things are done, by a function of (done, total)."""
+        with self.terminal.counting(what) as count:
+
+            def tell(done: int, total: int) -> None:
+                count(done, total)
+                self.operator.wait(what, done, total)
+
+            yield tell
+
+    @contextmanager
+    def listening(self, what: str) -> Iterator[Listener]:
+        """Show terminal and operator how the frames of a capture come in."""
+        with self.counting(f"{what}: frame") as count:
+            yield FrameCounter(count, self.terminal.note)
+
+    def hold_facing(
+        self, bench: Bench, step: Step, title: str, instruction: str, *, nearest: bool = False
+    ) -> None:
         """Have the board held in the middle of the working volume, or where it is brightest, facing the camera.
 
         Raises
@@ -123,24 +137,65 @@ class Work:
         """
         geometry = self.settings.geometry
         pose = BoardPose(geometry.nearest_mm if nearest else (geometry.nearest_mm + geometry.farthest_mm) / 2)
-        if (
-            self.operator.hold_board(bench, self.board, Request(step, "in the middle, facing", why, pose))
-            is Answer.STOP
-        ):
-            raise StoppedError("stopped by the operator", "The same command goes on from here.")
+        answer = self.operator.hold_board(bench, self.board, Request(step, title, instruction, pose))
+        if answer is Answer.STOP:
+            raise stopped()
 
-    def report(self, step: str, document: Mapping[str, Any], findings: Sequence[Finding], lines: Sequence[str]) -> None:
+    def report(
+        self,
+        step: Step,
+        document: Mapping[str, Any],
+        findings: Sequence[Finding],
+        lines: Sequence[str],
+        curve: Curve | None = None,
+        bars: tuple[Bar, ...] = (),
+    ) -> None:
         """Tell what a step has found, keep it, and stop where it cannot be gone on with.
 
         Raises
         ------
         StepFailedError
             A finding refuses; the step is not marked as done.
+        StoppedError
+            The operator has left after that.
         """
         self.terminal.say([f"{step}: {line}" for line in lines])
-        for finding in findings:
-            if not finding.refuses:
-                self.terminal.note(f"{finding.what}. {finding.remedy}")
+        notes = [f"{finding.what}. {finding.remedy}" for finding in findings if not finding.refuses]
+        for note in notes:
+            self.terminal.note(note)
         if any(f.refuses for f in findings):
             raise StepFailedError.of(step, findings)
         self.folder.finish(step, {**document, "findings": [vars(f) for f in findings]})
+        self.operator.learn(Outcome(step, tuple(lines), tuple(notes), curve, bars))
+
+
+@dataclass
+class FrameCounter:
+    """Listens to an acquisition and counts its frames.
+
+    Parameters
+    ----------
+    count
+        Is told of (done, total) frames.
+    remark
+        Is told what the operator should read.
+    """
+
+    count: Callable[[int, int], None]
+    remark: Callable[[str], None]
+
+    def state(self, state: ScanState, what: str) -> None:
+        """Not shown: a count says enough."""
+
+    def frame(self, progress: Progress) -> None:
+        """Count."""
+        self.count(progress.done, progress.total)
+
+    def note(self, text: str) -> None:
+        """Show what was repeated, and why."""
+        self.remark(text)
+
+
+def stopped(what: str = "stopped by the operator") -> StoppedError:
+    """The error of an operator who leaves for now."""
+    return StoppedError(what, "Everything so far is kept; the same command goes on from here.")

@@ -14,7 +14,7 @@ from calibration.planning.poses import placed
 from calibration.solver.adjustment import normals, solved
 from calibration.solver.measurements import Measurements
 from calibration.solver.parameters import State
-from calibration.solver.projection import predicted
+from calibration.solver.projection import linearised, predicted
 from calibration.solver.result import Calibration
 from scanner.rig import Lens, Rig
 
@@ -22,10 +22,11 @@ Array = NDArray[np.float64]
 
 _TILTS = ((0, 0), (30, 0), (-30, 0), (0, 30), (0, -30), (22, 22), (-22, 22), (22, -22), (-22, -22))
 _DISTANCES = (0.85, 1.0, 1.18)  # of the working distance
+_ROLL = 15.0  # °; edges along the pixels' rows meet every pixel alike, and the same error of sampling in all of them
 _PLACES = (-1, 0, 1)
 _MOST_POINTS = 36  # stand for the whole board: information depends on where it is, not on how finely it is divided
 _FOCAL, _CENTRE_PX, _BASELINE = 3e-4, 1.0, 2e-4  # what a good calibration reaches: weighs px against mm
-_MARGIN = 0.015  # of the picture: nobody holds a board to the pixel
+_MARGIN = 0.03  # of the picture: nobody holds a board to the pixel
 _FILL = 0.55
 
 
@@ -112,14 +113,17 @@ def first_poses(camera: Lens, board_points: Array, rig: Rig | None = None) -> tu
         (1.0, 0, 0, 0, 0), (1.0, 30, 0, 0, 0), (1.0, -30, 0, 0, 0), (1.0, 0, 30, 0, 0), (1.0, 0, -30, 0, 0),
         (0.9, 22, 22, -1, -1), (0.9, -22, -22, 1, 1), (1.2, 22, -22, 1, -1), (1.2, -22, 22, -1, 1),
     ]  # fmt: skip
-    poses = [_at(camera, board_points, distance * d, yaw, pitch, x, y) for d, yaw, pitch, x, y in wanted]
+    poses = [
+        _at(camera, board_points, distance * d, (yaw, pitch, _ROLL * (-1) ** number), x, y)
+        for number, (d, yaw, pitch, x, y) in enumerate(wanted)
+    ]
     return tuple(pose for pose in poses if visible(pose, board_points, camera, rig))
 
 
 def grid(camera: Lens, board_points: Array, distance_mm: float) -> Iterable[BoardPose]:
-    """Candidates: nine tilts at nine places of the picture and three distances about ``distance_mm``."""
-    for d, (yaw, pitch), y, x in product(_DISTANCES, _TILTS, _PLACES, _PLACES):
-        yield _at(camera, board_points, distance_mm * d, yaw, pitch, x, y)
+    """Candidates: nine tilts at nine places of the picture and three distances about ``distance_mm``, all rolled."""
+    for d, (number, (yaw, pitch)), y, x in product(_DISTANCES, enumerate(_TILTS), _PLACES, _PLACES):
+        yield _at(camera, board_points, distance_mm * d, (yaw, pitch, _ROLL * (-1) ** (number + x + y)), x, y)
 
 
 def visible(pose: BoardPose, board_points: Array, camera: Lens, rig: Rig | None = None) -> bool:
@@ -138,18 +142,21 @@ def visible(pose: BoardPose, board_points: Array, camera: Lens, rig: Rig | None 
     return True
 
 
-def _at(camera: Lens, board: Array, distance: float, yaw: float, pitch: float, side: int, height: int) -> BoardPose:
+def _at(
+    camera: Lens, board: Array, distance: float, turns: tuple[float, float, float], side: int, height: int
+) -> BoardPose:
     """Pose in the middle (0) or as far to a side (±1) as the board still fits the camera's picture."""
+    yaw, pitch, roll = turns
     size = np.array(camera.size, np.float64)
     focal = np.array([camera.matrix[0, 0], camera.matrix[1, 1]])
-    R, _ = placed(BoardPose(distance, yaw_deg=yaw, pitch_deg=pitch))
+    R, _ = placed(BoardPose(distance, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll))
     # The board's picture, as wide as its nearest edge makes it.
     X = board @ R.T + np.array([0, 0, distance])
     half = np.abs(X[:, :2] / X[:, 2:] * focal).max(0)
     room = np.maximum((1 - 2 * _MARGIN) * size / 2 - half - 0.02 * size, 0)
     centre = (size - 1) / 2 - np.array([camera.matrix[0, 2], camera.matrix[1, 2]])
     x, y = (centre + room * (side, height)) / focal * distance
-    return BoardPose(distance, float(x), float(y), yaw, pitch)
+    return BoardPose(distance, float(x), float(y), yaw, pitch, roll)
 
 
 def _information(calibration: Calibration, pool: Sequence[BoardPose], board_points: Array) -> Array:
@@ -178,9 +185,14 @@ def _information(calibration: Calibration, pool: Sequence[BoardPose], board_poin
         np.tile(np.arange(len(points)), len(pool)),
         np.zeros((2, count, 2)),
         weight,
+        np.zeros((count, 2, 2)),
         calibration.data.extent,
         len(pool),
     )
+    if calibration.data.gradient.any():
+        # How the board takes the camera's picture to the projector's.
+        _, _, _, by_point = linearised(state, flat)
+        flat = replace(flat, gradient=by_point[1][..., :2] @ np.linalg.inv(by_point[0][..., :2]))
     free = replace(calibration.freedom, board_prior=None)
     system, _, _ = normals(state, replace(flat, measured=predicted(state, flat)), free, calibration.adjusted.scales)
     return system.shares()[0]

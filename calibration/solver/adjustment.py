@@ -90,7 +90,7 @@ class Adjusted:
     raw_scales
         (2,) the same without the lower limit.
     residuals
-        (2, N, 2) measured − predicted, px; 0 where nothing was measured.
+        (2, N, 2) measured − predicted, px, the projector's at the camera's places; 0 where nothing was measured.
     weights
         (2, N) Huber weights of points.
     cost

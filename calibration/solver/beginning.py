@@ -42,7 +42,7 @@ def begun(data: Measurements, camera_size: tuple[int, int], projector_size: tupl
     flat = np.zeros((data.board_size, 3))
     state = State(values, np.stack([R for R, _ in poses]), np.stack([t for _, t in poses]), flat)
     model = Model(state, axes, camera_size, projector_size)
-    state = adjusted(state, data.of_lens(0), model.camera_only(Terms(("k1",)))).state
+    state = adjusted(state, data.of_camera(), model.camera_only(Terms(("k1",)))).state
     X = np.einsum("nij,nj->ni", state.turns[data.pose], data.points) + state.shifts[data.pose]
     lens, R, T = _projector(X, data, axes, projector_size, state)
     values = state.values.copy()

@@ -29,7 +29,9 @@ class Measurements:
     measured
         (2, N, 2) px: camera, projector; 0 where nothing was measured.
     weight
-        (2, N, 2) 1/σ²; 0 where nothing was measured.
+        (2, N, 2) 1/σ²; 0 where nothing was measured. The projector's is that of its coordinate at the camera's place.
+    gradient
+        (N, 2, 2) by which the projector's coordinates err with the camera's, px/px.
     extent
         Half of the board's larger side, mm: where a bend is stated.
     count
@@ -41,6 +43,7 @@ class Measurements:
     point: NDArray[np.int64]
     measured: Array
     weight: Array
+    gradient: Array
     extent: float
     count: int
 
@@ -59,11 +62,9 @@ class Measurements:
         ends = np.searchsorted(self.pose, np.arange(self.count + 1)).tolist()
         return [slice(a, b) for a, b in pairwise(ends)]
 
-    def of_lens(self, lens: int) -> Measurements:
-        """The same with the other lens's coordinates unmeasured; 0 camera, 1 projector."""
-        weight = np.zeros_like(self.weight)
-        weight[lens] = self.weight[lens]
-        return replace(self, weight=weight)
+    def of_camera(self) -> Measurements:
+        """The same with the projector's coordinates unmeasured."""
+        return replace(self, weight=self.weight * np.array([1.0, 0.0])[:, None, None])
 
 
 def gathered(observations: Sequence[PoseObservation], keep: Sequence[NDArray[np.bool_]] | None = None) -> Measurements:
@@ -87,10 +88,18 @@ def gathered(observations: Sequence[PoseObservation], keep: Sequence[NDArray[np.
     measured, sigma = np.stack(pairs).astype(np.float64), np.stack(sigmas).astype(np.float64)
     known = np.isfinite(measured) & np.isfinite(sigma) & (sigma > 0)
     weight = np.where(known, 1 / np.where(known, sigma, 1.0) ** 2, 0.0)
+    gradient = np.concatenate(
+        [
+            np.broadcast_to(o.projector_gradient, (*o.camera.shape, 2))[k]
+            for o, k in zip(observations, chosen, strict=True)
+        ]
+    )
     extent = float(np.ptp(points[:, :2], axis=0).max()) / 2
     ids = np.concatenate([o.ids[k] for o, k in zip(observations, chosen, strict=True)])
     _, point = np.unique(ids, return_inverse=True)
-    return Measurements(points, pose, point, np.where(known, measured, 0.0), weight, extent, len(observations))
+    return Measurements(
+        points, pose, point, np.where(known, measured, 0.0), weight, gradient * known[0][:, None], extent, len(chosen)
+    )
 
 
 def _columns(sigma: Array) -> Array:

@@ -2,6 +2,10 @@
 
 X_cam = R (X_board + bend) + t and X_proj = R_rig X_cam + T go through OpenCV's lens model; `cv2.projectPoints` gives
 the derivatives after its lens and, through its translation, after the point. The rest is the chain rule.
+
+The projector's coordinate x was read at the place c where the camera has found a point, so that an error e of c errs it
+by G e. What is predicted for it is therefore x(θ) + G (c − c(θ)): the residuals of camera and projector are then
+independent, and their weights those of their own errors (Cholesky's factor of the joint covariance, in closed form).
 """
 
 from __future__ import annotations
@@ -17,11 +21,12 @@ Array = NDArray[np.float64]
 
 
 def predicted(state: State, data: Measurements) -> Array:
-    """(2, N, 2) px of all points in camera and projector."""
+    """(2, N, 2) px of all points in camera and projector, the latter's at the places where the camera found them."""
     board, _ = _board(state, data)
     X = np.einsum("nij,nj->ni", state.turns[data.pose], board) + state.shifts[data.pose]
     Y = X @ state.rotation.T + state.values[TRANSLATION]
-    return np.stack([_lens(state.values[CAMERA], X)[0], _lens(state.values[PROJECTOR], Y)[0]])
+    camera, projector = _lens(state.values[CAMERA], X)[0], _lens(state.values[PROJECTOR], Y)[0]
+    return np.stack([camera, projector + _moved(data, camera)])
 
 
 def linearised(state: State, data: Measurements) -> tuple[Array, Array, Array, Array]:
@@ -57,13 +62,21 @@ def linearised(state: State, data: Measurements) -> tuple[Array, Array, Array, A
     by_globals[0, :, :, BEND.start :] = by_X @ X_board
 
     projector, by_Y, by_lens = _lens(state.values[PROJECTOR], rotated + state.values[TRANSLATION])
-    pixels[1], by_globals[1, :, :, PROJECTOR] = projector, by_lens
+    pixels[1], by_globals[1, :, :, PROJECTOR] = projector + _moved(data, camera), by_lens
     by_globals[1, :, :, ROTATION] = by_Y @ _minus_cross(rotated)
     by_globals[1, :, :, TRANSLATION] = by_Y
     through = by_Y @ rotation
     by_pose[1] = through @ X_pose
     by_globals[1, :, :, BEND.start :] = through @ X_board
-    return pixels, by_globals, by_pose, np.stack([by_X @ turn, through @ turn])
+    by_point = np.stack([by_X @ turn, through @ turn])
+    for derivatives in (by_globals, by_pose, by_point):
+        derivatives[1] -= data.gradient @ derivatives[0]
+    return pixels, by_globals, by_pose, by_point
+
+
+def _moved(data: Measurements, camera: Array) -> Array:
+    """(N, 2) by how much projector coordinates are others because the camera's points are not where they should be."""
+    return np.asarray(np.einsum("nij,nj->ni", data.gradient, data.measured[0] - camera))
 
 
 def _board(state: State, data: Measurements) -> tuple[Array, Array]:

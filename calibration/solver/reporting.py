@@ -48,10 +48,12 @@ def reported(
         state.values[TRANSLATION],
     )
     values = np.array([state.values[int(np.flatnonzero(column)[0])] for column in freedom.spread.T])
-    rms = _rms(fit.adjusted.residuals**2, fit.data)
+    rms = _rms(_as_measured(fit.adjusted.residuals, fit.data) ** 2, fit.data)
     share = fit.adjusted.redundancy / np.maximum(fit.data.known.sum(axis=(1, 2)), 1)
     variance = np.divide(1.0, fit.data.weight, out=np.zeros_like(fit.data.weight), where=fit.data.known)
-    predicted_rms = _rms(variance * share[:, None, None], fit.data)
+    variance *= share[:, None, None]
+    variance[1] += np.where(fit.data.known[1], np.einsum("nij,nj->ni", fit.data.gradient**2, variance[0]), 0.0)
+    predicted_rms = _rms(variance, fit.data)
     poses = _poses(observations, usable, kept, fit)
     return Calibration(
         rig,
@@ -89,6 +91,12 @@ def annotated(c: Calibration, validity: Mapping[str, Any]) -> Calibration:
     }
     document = notes(c.names, c.values, c.covariance, c.terms, figures, c.poses, c.findings, validity)
     return replace(c, rig=replace(c.rig, metadata={"calibration": document}))
+
+
+def _as_measured(residuals: Array, data: Measurements) -> Array:
+    """Residuals (2, N, 2) with the projector's as they were measured, what the camera's do to them included."""
+    whole = residuals[1] + np.einsum("nij,nj->ni", data.gradient, residuals[0])
+    return np.stack([residuals[0], np.where(data.known[1], whole, 0.0)])
 
 
 def _rms(squares: Array, data: Measurements) -> tuple[float, float, float]:

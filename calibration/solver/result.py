@@ -34,7 +34,8 @@ class PoseResult:
     rotation, translation
         (3, 3), (3,) mm: X_cam = R X_board + t.
     camera, projector
-        (n, 2) residuals measured − predicted, px; NaN where nothing was measured or the point was left out.
+        (n, 2) residuals measured − predicted, px, the projector's at the places where the camera found the points; NaN
+        where nothing was measured or the point was left out.
     camera_sigmas, projector_sigmas
         (n, 2) the same in units of the scaled σ.
     projector_px
@@ -87,7 +88,8 @@ class Calibration:
     scale_camera, scale_projector
         Observed over stated σ of camera and projector (variance components); below 1 where σ was stated too large.
     rms_camera, rms_projector, rms_stereo
-        Reprojection errors, px: √mean(dx² + dy²), as OpenCV states them; stereo is over the points of both.
+        Reprojection errors, px: √mean(dx² + dy²), as OpenCV states them: the projector's hold what the camera's errors
+        do to them. Stereo is over the points of both.
     expected_camera, expected_projector, expected_stereo
         What the stated σ predict for them, px.
     findings

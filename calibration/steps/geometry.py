@@ -34,6 +34,9 @@ STEP: Step = "geometry"
 _BEGINNING = 4
 """Poses by a fixed scheme before the covariance of what is known chooses."""
 
+_ROLL = 15.0
+"""°, of a board that faces the camera: no edge runs along the pixels' rows."""
+
 _PERIODS = (16.0, 80.0)
 """Fringes that are fine enough for a board's small squares, px; a third spans the projector."""
 
@@ -132,7 +135,9 @@ def _request(
     middle = (settings.nearest_mm + settings.farthest_mm) / 2
     title = f"pose {len(poses) + 1} of {settings.poses}"
     if not poses:
-        return Request(STEP, title, "in the middle of the picture, facing the camera", BoardPose(middle))
+        return Request(
+            STEP, title, "in the middle of the picture, facing the camera", BoardPose(middle, roll_deg=_ROLL)
+        )
     if calibration is None or len(poses) < _BEGINNING:
         lens = guessed_lens(poses[0].points_board, poses[0].camera, middle, camera_size)
         scheme = first_poses(lens, work.board.points)
@@ -141,7 +146,9 @@ def _request(
     pool = [_within(work, p) for p in grid(calibration.rig.camera, work.board.points, middle)]
     found = next_pose(calibration, work.board.points, pool)
     if found is None:
-        return Request(STEP, title, "in the middle of the picture, facing the camera", BoardPose(middle))
+        return Request(
+            STEP, title, "in the middle of the picture, facing the camera", BoardPose(middle, roll_deg=_ROLL)
+        )
     return Request(STEP, title, f"{found.reason}", found.pose, f"lowers the uncertainty by {100 * found.gain:.0f} %")
 
 
