@@ -7,7 +7,7 @@ altogether, and with three to seven steps whether their mean is that of all othe
 hardly beyond the noise, the sequences of a round show of each other once it is complete (`agreement`). Where each
 frequency has one frame, their code takes the place of the other sequences (`codes`).
 
-Not to be seen from images: a lamp that follows the steps; an error of all frames alike; and that the very first sequence
+Not to be seen from images: a lamp that follows the steps; an error of all frames alike; that the very first sequence
 of an axis began at another step, before others of the axis contradict it, which then are the ones that are refused.
 """
 
