@@ -6,7 +6,8 @@
 
 While one sequence is photographed, a second thread checks, commits and demodulates the one before it. A sequence that
 fails its check, or in which a device failed, is taken again, at most as often as the scan allows; the bench brings a
-device back that was lost. On every way out the projector is dark.
+device back that was lost. When all sequences of a round are there, they are compared: one that is at odds with the
+others is revoked and taken again as well. On every way out the projector is dark.
 """
 
 from __future__ import annotations
@@ -288,14 +289,21 @@ class Acquisition:
         # Two buffers take turns: one is being filled while the other is checked and demodulated.
         buffers = [np.zeros((longest, *fmt.shape), fmt.dtype) for _ in range(2)]
         queue = [(sequence, 1) for sequence in range(len(plan.sequences))]
+        attempts: dict[int, int] = {}
         pending: tuple[int, int, Future[list[str]]] | None = None
         turn = 0
         with ThreadPoolExecutor(1, thread_name_prefix="decode") as worker, self._timed(f"capture round {number}"):
             try:
-                while queue or pending:
+                while True:
+                    if not queue and pending is None:
+                        queue = self._at_odds(number, plan, attempts)
+                        if not queue:
+                            break
+                        collected = self._collect_again(number, plan)
                     launched = None
                     if queue:
                         sequence, attempt = queue.pop(0)
+                        attempts[sequence] = attempt
                         frames = buffers[turn % 2][: len(plan.sequences[sequence].fringes)]
                         try:
                             self._expose_sequence(number, plan, sequence, attempt, frames, total)
@@ -373,8 +381,12 @@ class Acquisition:
     ) -> list[tuple[int, int]]:
         """Wait for a sequence's check; returns it again, with the next attempt, where it failed."""
         reasons = job.result()
-        if not reasons:
-            return []
+        return self._refused(number, plan, sequence, attempt, reasons) if reasons else []
+
+    def _refused(
+        self, number: int, plan: Plan, sequence: int, attempt: int, reasons: list[str]
+    ) -> list[tuple[int, int]]:
+        """Return a sequence that failed its check again, with the next attempt, where there is one."""
         if attempt >= self.scan.attempts:
             label = plan.sequences[sequence].label
             raise AcquisitionError(
@@ -383,6 +395,26 @@ class Acquisition:
                 "Raise the bench's settle time (display latency), and check that nothing moves and no light flickers.",
             )
         return self._again(number, plan, sequence, attempt, reasons[0])
+
+    def _at_odds(self, number: int, plan: Plan, attempts: Mapping[int, int]) -> list[tuple[int, int]]:
+        """Revoke sequences that the rest of their round contradicts; returns them, each with its next attempt."""
+        again = []
+        for found in self._history.at_odds(self.bench.frame_format.shape):
+            places = [(s.axis, s.frequency) for s in plan.sequences]
+            sequence = places.index((found.axis, found.frequency))
+            attempt = attempts[sequence]
+            self.take.abort_sequence(number, sequence, attempt, found.message)
+            again += self._refused(number, plan, sequence, attempt, [found.message])
+        return again
+
+    def _collect_again(self, number: int, plan: Plan) -> RoundFrames:
+        """Collect what still counts of a round from the recording: no trace is left of what was revoked."""
+        collected = self.method.collect(plan, self.bench.frame_format)
+        for sequence in range(len(plan.sequences)):
+            frames = self.take.committed_frames(number, sequence)
+            if frames is not None:
+                collected.add(sequence, frames)
+        return collected
 
     def _broken(
         self, number: int, plan: Plan, sequence: int, attempt: int, error: HardwareError

@@ -94,21 +94,32 @@ class Books:
 
     camera: SimulatedCamera
     attempts: dict[tuple[int, int, int], list[int]] = field(default_factory=dict)
+    frames: dict[tuple[int, int, int], list[Any]] = field(default_factory=dict)
     plans: dict[int, Any] = field(default_factory=dict)
     committed: list[tuple[int, int, int]] = field(default_factory=list)
     aborted: dict[tuple[int, int, int], str] = field(default_factory=dict)
+    revoked: list[tuple[int, int, int]] = field(default_factory=list)
 
     def begin_round(self, number, plan):
         self.plans[number] = Plan.from_json(plan)
 
     def write_frame(self, number, sequence, attempt, index, frame, stamp):
         self.attempts.setdefault((number, sequence, attempt), []).append(self.camera.exposures - 1)
+        self.frames.setdefault((number, sequence, attempt), []).append(frame.copy())
 
     def commit_sequence(self, *key):
         self.committed.append(key)
 
     def abort_sequence(self, number, sequence, attempt, reason):
-        self.aborted[number, sequence, attempt] = reason
+        key = (number, sequence, attempt)
+        self.aborted[key] = reason
+        if key in self.committed:
+            self.committed.remove(key)
+            self.revoked.append(key)
+
+    def committed_frames(self, number, sequence):
+        kept = [key for key in self.committed if key[:2] == (number, sequence)]
+        return np.stack(self.frames[kept[-1]]) if kept else None
 
     def state(self, state):
         pass
@@ -190,6 +201,17 @@ def judge(books: Books, light: Formula, camera: SimulatedCamera, tally: Tally, c
     preflight = wrong.keys() - {number for exposures in books.attempts.values() for number in exposures}
     committed_wrong = False
     refused = []
+    revoked_wrong = [key for key in books.revoked if any(number in wrong for number in books.attempts[key])]
+
+    def contradicted(key: tuple[int, int, int]) -> bool:
+        """Whether a good sequence was revoked because of a wrong one that counted until it was revoked as well.
+
+        Of three frequencies two are at odds alike.
+        """
+        axis = books.plans[key[0]].sequences[key[1]].axis
+        others = [k for k in revoked_wrong if k[0] == key[0] and books.plans[k[0]].sequences[k[1]].axis == axis]
+        return key in books.revoked and bool(others)
+
     for key, exposures in books.attempts.items():
         bad = [number for number in exposures if number in wrong]
         tally.frames += len(exposures)
@@ -207,7 +229,7 @@ def judge(books: Books, light: Formula, camera: SimulatedCamera, tally: Tally, c
             tally.repeated += 1
             complete = len(exposures) == len(plan.sequences[key[1]].fringes)
             verdict = BY_IMAGES if complete else BY_DEVICE
-            if complete and not bad and key in books.aborted:
+            if complete and not bad and key in books.aborted and not contradicted(key):
                 refused.append(f"{name} {key}: {books.aborted[key]}")
         for number in bad:
             tally.found[label(wrong[number]), verdict] += 1

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import NoiseModel
+from scanner.integrity.code_errors import STEPS, Codes, code_errors
 from scanner.integrity.findings import Finding
 from scanner.integrity.sampling import Grid
 from scanner.integrity.waveform import FEWEST, Waveform
@@ -15,7 +16,6 @@ from scanner.patterns import FringeSequence
 from scanner.unwrapping import Coordinates
 
 _WHOLE, _PART = (1.6, 1.2, 1.5), (5.0, 1.5, 5.0)
-_STEPS = 3
 _SAME_PICTURE, _OTHER_PICTURE = 1.5, 4.0
 _ASKED = 2_000
 _FEWEST_OF_BAND = 40
@@ -35,7 +35,8 @@ def wrong_codes(
 
     Notes
     -----
-    Where harmonics spoil all codes alike, no single frame is to blame, and none is named.
+    Where no single frame is to blame, either harmonics spoil all codes alike, which is a property of the projector and
+    is let pass, or several frames are wrong.
     """
     pixels = np.flatnonzero(waveform.usable)
     if pixels.size < FEWEST:
@@ -55,11 +56,8 @@ def wrong_codes(
     together = misfits(None)
     # In a part of the picture many pixels may see two paths of light, which fit no code either.
     limits = [_WHOLE] + [_PART] * (len(bands) - 1)
-    if all(whole < misfit for whole, (misfit, _, _) in zip(together, limits, strict=True)):
-        return []
-    first_single = next(n for n, f in enumerate(fringes.fringes) if f.frequency != fringes.fringes[0].frequency)
     found = []
-    for n in range(first_single, count):
+    for n in range(STEPS, count) if any(t > limit for t, (limit, _, _) in zip(together, limits, strict=True)) else ():
         for band, whole, without, (misfit, fits, better) in zip(bands, together, misfits(n), limits, strict=True):
             if whole > misfit and without < fits and whole > better * without:
                 rows = cells.rows_px[band]
@@ -68,7 +66,10 @@ def wrong_codes(
                     Finding(n, f"frame {n + 1} does not fit the code of the others{where}: stale, torn or mixed")
                 )
                 break
-    return found
+    if found:
+        return found
+    everything = _decoded(values, fringes, list(range(count)), extent, waveform.sigma_dn, pixels)
+    return code_errors(Codes.of(values[:, pixels], fringes, everything, waveform.sigma_dn))
 
 
 def _shown_again(
@@ -82,7 +83,7 @@ def _shown_again(
         if seen > _SAME_PICTURE * noise:
             continue
         # Where the pixels lie, the others tell: two frequencies may be alike over all of a small object.
-        kept = [k for k in range(len(fringes.fringes)) if k < _STEPS or k not in (n - 1, n)]
+        kept = [k for k in range(len(fringes.fringes)) if k < STEPS or k not in (n - 1, n)]
         c = _decoded(values, fringes, kept, extent, waveform.sigma_dn, pixels)
         now, before = (
             np.cos(2 * np.pi * f.frequency * c.u[0] + f.step_rad) for f in (fringes.fringes[n], fringes.fringes[n - 1])

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.patterns import Axis
+
 SEQUENCE = -1
 """The frame of a finding that concerns a sequence as a whole."""
 
@@ -16,6 +18,15 @@ class Finding:
     """Something wrong with one sequence: ``frame`` counts from 0 within it, -1 for the sequence as a whole."""
 
     frame: int
+    message: str
+
+
+@dataclass(frozen=True)
+class AtOdds:
+    """A sequence of ``axis`` and ``frequency`` (1/px) that contradicts the rest of its round, and how, in words."""
+
+    axis: Axis
+    frequency: float
     message: str
 
 

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import Pixels
+from scanner.integrity.agreement import Shown, same, standing_out
+from scanner.integrity.findings import AtOdds
 from scanner.integrity.sampling import Grid, gradients, grid
 from scanner.integrity.waveform import FEWEST, Reference, Waveform, other_mean
 from scanner.patterns import Axis, FringeSequence
@@ -28,16 +30,7 @@ _CONVINCED = 50.0
 _AGREED, _DISAGREED = 0.6, 0.2
 _ASKED = 128
 _UNWRAP_FROM = 2
-
-
-@dataclass
-class _Shown:
-    axis: Axis
-    frequency: float
-    z: NDArray[np.complex64]
-    sigma_z: float
-    usable: NDArray[np.bool_]
-    round: int
+_NEARLY_AS_SURE = 0.5
 
 
 @dataclass
@@ -58,8 +51,12 @@ class SequenceHistory:
 
     _round: int = 0
     _noises: list[float] = field(default_factory=list)
-    _shown: list[_Shown] = field(default_factory=list)
+    _shown: list[Shown] = field(default_factory=list)
+    _doubted: dict[tuple[int, Axis, float], list[Shown]] = field(default_factory=dict)
+    _settled: set[tuple[int, Axis, float]] = field(default_factory=set)
     _last: NDArray[np.float32] | None = None
+    _latest: NDArray[np.float32] | None = None
+    _former: NDArray[np.float32] | None = None
     _mean: NDArray[np.float32] | None = None
     _means: int = 0
     _modulation: NDArray[np.float32] | None = None
@@ -125,6 +122,7 @@ class SequenceHistory:
     def ended(self, last: NDArray[np.float32], good: bool) -> None:
         """Take over the last frame of a sequence at the sampled pixels; of a bad one nobody knows what it shows."""
         self._last = last if good else None
+        self._former, self._latest = self._latest, last
 
     def accept(self, fringes: FringeSequence, waveform: Waveform, valid: NDArray[np.bool_]) -> None:
         """Take over a sequence that was found good."""
@@ -143,11 +141,44 @@ class SequenceHistory:
         self._modulation = np.where(waveform.usable, np.abs(waveform.z), np.float32(0))
         if fringes.frequency is not None:
             sigma_z = waveform.sigma_dn * float(np.sqrt(2 / len(fringes.fringes)))
-            shown = _Shown(fringes.axis, fringes.frequency, waveform.z, sigma_z, waveform.usable, self._round)
+            shown = Shown(
+                fringes.axis, fringes.frequency, waveform.z, sigma_z, waveform.usable, self._round, self._former
+            )
             self._shown = [
                 s for s in self._shown if (s.axis, s.frequency, s.round) != (shown.axis, shown.frequency, shown.round)
             ]
             self._shown.append(shown)
+
+    def at_odds(self, shape: tuple[int, int]) -> list[AtOdds]:
+        """Sequences of this round, one an axis at most, that contradict the others, once all were found good.
+
+        To be asked again when they were taken again. One that comes out the same twice is believed: then another may be
+        the wrong one, or none, and the scene or the bench makes the difference.
+
+        Parameters
+        ----------
+        shape
+            Of a frame, (H, W).
+        """
+        shown = [s for s in self._shown if s.round == self._round]
+        sure = standing_out(shown, self._extent, grid(shape))
+        found = []
+        for axis in self._extent:
+            against = [(float(value), s) for value, s in zip(sure, shown, strict=True) if s.axis == axis and value > 1]
+            against.sort(key=lambda pair: -pair[0])
+            likely = [s for value, s in against if value > _NEARLY_AS_SURE * against[0][0]]
+            for s in sorted(likely, key=lambda s: len(self._doubted.get(_key(s), []))):
+                takes = self._doubted.setdefault(_key(s), [])
+                if takes and same(takes[-1], s):
+                    self._settled.add(_key(s))
+                if _key(s) not in self._settled:
+                    takes.append(s)
+                    what = (
+                        f"the phases are at odds with what the other frequencies of axis {axis} say of the same pixels"
+                    )
+                    found.append(AtOdds(axis, s.frequency, f"{what}: a frame was wrong, by little in each pixel"))
+                    break
+        return found
 
     def doubt_levels(self, waveform: Waveform, valid: NDArray[np.bool_], cells: Grid, count: int) -> bool:
         """Whether the levels, rather than a sequence that contradicts them, are wrong: one before agreed with it."""
@@ -247,7 +278,7 @@ class SequenceHistory:
 
     @staticmethod
     def _steeper(
-        former: _Shown, axis: Axis, frequency: float, waveform: Waveform, both: NDArray[np.bool_], sigma_z: float
+        former: Shown, axis: Axis, frequency: float, waveform: Waveform, both: NDArray[np.bool_], sigma_z: float
     ) -> bool:
         """Whether the phases rise from pixel to pixel as the former sequence's do, and not as this one's should."""
         whole = np.repeat(both.reshape(-1, 9).all(axis=1), 9)
@@ -325,6 +356,10 @@ class SequenceHistory:
             f"the phases fit no coordinate together with those of {len(former)} other sequences of axis "
             f"{fringes.axis}: pictures of another sequence, or in another order"
         )
+
+
+def _key(shown: Shown) -> tuple[int, Axis, float]:
+    return shown.round, shown.axis, shown.frequency
 
 
 def _lit_by(contrast: NDArray[np.float32]) -> NDArray[np.bool_]:

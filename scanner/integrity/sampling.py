@@ -48,6 +48,16 @@ class Grid:
     tile: NDArray[np.intp]
     tiles: int
 
+    @property
+    def bands(self) -> int:
+        """How many bands of rows the tiles make."""
+        return _TILES[0]
+
+    @property
+    def band(self) -> NDArray[np.intp]:
+        """(P,) number of the pixel's band of rows."""
+        return self.tile // _TILES[1]
+
     def take(self, frame: NDArray[np.generic]) -> NDArray[np.float32]:
         """(P,) values of a (H, W) picture."""
         return frame.reshape(-1).take(self.rows_px * self.shape[1] + self.columns_px).astype(np.float32)
@@ -61,7 +71,7 @@ class Grid:
         bad, seen = (t.reshape(_TILES).any(axis=1) for t in (alarm, judged))
         if not bad.any() or bad.sum() > 0.7 * seen.sum():
             return ""
-        rows = self.rows_px[np.isin(self.tile // _TILES[1], np.flatnonzero(bad))]
+        rows = self.rows_px[np.isin(self.band, np.flatnonzero(bad))]
         return f" in rows {int(rows.min()) + 1} to {int(rows.max()) + 1}"
 
     def sums(self, values: NDArray[np.float32], chosen: NDArray[np.bool_]) -> NDArray[np.float64]:

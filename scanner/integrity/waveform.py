@@ -22,6 +22,9 @@ changes a phase by (2/N) (e/B) sin φ, the noise by √(2/N) σ/B, and e = 0.6 �
 STEADY = 0.005
 """No lamp is steadier than this: errors below it, as a share of B for each of N/2 frames, are no reason for alarm."""
 
+HARMFUL = 0.25
+"""Mean square of a phase error, in units of that of its noise, that is worth another take: half the noise, rms."""
+
 ROUNDING_DN = 0.29
 """Standard deviation of a rounded grey value."""
 

@@ -2,6 +2,11 @@
 
 Three steps of the first frequency, one pattern of each other: a linear system gives [O, A cos φ₁, A sin φ₁,
 A cos φ₂ …]; divided by A it is compared with the code vectors of all projector columns, and φ₁ refines the nearest.
+
+The frames have nothing to spare by which a wrong one could be told, and the frequencies are so near to each other that
+over much of a picture each pattern is nearly the one before it: of a projector that lags, all pixels may fit codes of
+other columns. Every second of the single patterns is therefore turned by half a period. That costs no frame and no
+accuracy, and a frame that comes a pattern late is as wrong as can be.
 """
 
 from __future__ import annotations
@@ -75,7 +80,8 @@ class MicroPhaseShifting:
                     "Give at least two frequencies below 1/2.",
                 )
             first = [Fringe(frequencies[0], 2 * math.pi * n / _STEPS) for n in range(_STEPS)]
-            sequences.append(FringeSequence(axis, (*first, *(Fringe(f, 0.0) for f in frequencies[1:]))))
+            single = [Fringe(f, math.pi * (n % 2)) for n, f in enumerate(frequencies[1:])]
+            sequences.append(FringeSequence(axis, (*first, *single)))
         return Plan(size, tuple(sequences), scan.mean, scan.amplitude)
 
     def collect(self, plan: Plan, frame_format: FrameFormat) -> CodeFrames:
@@ -153,8 +159,9 @@ def nearest_code(
         for order in range(-1, math.ceil(extent / period) + 1):
             place = u0[here] + np.float32(order * period)
             cost = np.zeros(stop - start, np.float32)
-            for k, f in enumerate(frequency[1:]):
-                cost += (code[k] - np.cos(np.float32(2 * np.pi * f) * place)) ** 2
+            for k, fringe in enumerate(fringes.fringes[_STEPS:]):
+                angle = np.float32(2 * np.pi * fringe.frequency) * place + np.float32(fringe.step_rad)
+                cost += (code[k] - np.cos(angle)) ** 2
             cost[(place < -0.5) | (place >= extent - 0.5)] = np.inf
             better = cost < best[here]
             second[here] = np.where(better, best[here], np.minimum(second[here], cost))

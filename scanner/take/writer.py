@@ -176,7 +176,7 @@ class TakeWriter:
         with ExitStack() as on_error:
             on_error.callback(self._files.close)
             try:
-                self._open_files(os.O_WRONLY)
+                self._open_files(os.O_RDWR)
             except OSError as error:
                 raise TakeRefusedError(
                     f"{path} cannot be written: {error.strerror}",
@@ -294,6 +294,17 @@ class TakeWriter:
             self._abort((round, sequence, attempt), reason)
             self._sync(self._journal_fd)
 
+    def committed_frames(self, round: int, sequence: int) -> Pixels | None:
+        """Read the (N, height, width) frames of a sequence that counts, in the order of the plan; None if none does."""
+        recorded = self._safe.get((round, sequence))
+        if recorded is None:
+            return None
+        fmt = self.frame_format
+        length = math.prod(fmt.shape) * fmt.dtype.itemsize
+        with self._guard(f"reading sequence {sequence} of round {round}"):
+            data = [os.pread(self._frames_fd, length, slot * self._stride) for slot in recorded.slots]
+        return np.stack([np.frombuffer(pixels, fmt.dtype).reshape(fmt.shape) for pixels in data])
+
     def note(self, text: str) -> None:
         """Add a line to the operator's log."""
         with self._lock, self._guard("writing a note"):
@@ -367,7 +378,7 @@ class TakeWriter:
         with ExitStack() as on_error:
             on_error.callback(shutil.rmtree, self.path, ignore_errors=True)
             on_error.callback(self._files.close)
-            self._open_files(os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+            self._open_files(os.O_RDWR | os.O_CREAT | os.O_EXCL)
             self._reserve(slots)
             self._sync(self._frames_fd)
             temporary = self.path / f"{MANIFEST}.tmp"

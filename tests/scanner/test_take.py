@@ -976,6 +976,26 @@ class TestResume:
                 TakeWriter.resume(copy)
 
 
+class TestRevoking:
+    def test_a_committed_sequence_is_revoked_and_taken_again(self, path: Path) -> None:
+        with create(path) as writer:
+            writer.begin_round(1, PLANS[1])
+            for sequence in (0, 1):
+                write_sequence(writer, 1, sequence, 1)
+                writer.commit_sequence(1, sequence, 1)
+            assert np.array_equal(writer.committed_frames(1, 0), pictures(GREY8, 1, 0, 1))
+            writer.abort_sequence(1, 0, 1, "at odds with the others")
+            assert writer.committed_frames(1, 0) is None
+            assert Take.open(path).missing(1) == (0,)
+            write_sequence(writer, 1, 0, 2)
+            writer.commit_sequence(1, 0, 2)
+            assert np.array_equal(writer.committed_frames(1, 0), pictures(GREY8, 1, 0, 2))
+            assert np.array_equal(writer.committed_frames(1, 1), pictures(GREY8, 1, 1, 1))
+        take = Take.open(path)
+        assert {s: recorded.attempt for s, recorded in take.sequences(1).items()} == {0: 2, 1: 1}
+        assert np.array_equal(take.frames(1, 0), pictures(GREY8, 1, 0, 2))
+
+
 class TestRefusals:
     def test_an_existing_folder(self, path: Path) -> None:
         path.mkdir()

@@ -1,0 +1,118 @@
+"""A sequence that is wrong by about the noise stands out among the others of its round; bounces and gamma do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scanner.integrity.agreement import Shown, same, standing_out
+from scanner.integrity.sampling import grid
+from scanner.patterns import phase_steps
+
+SHAPE = (48, 64)
+EXTENT = {"x": 320, "y": 200}
+MICRO = tuple((20 + t) / 320 for t in range(9))
+TEMPORAL = (1 / 16, 10 / 320, 1 / 320)
+
+
+def frames_of(frequency, steps, random, gamma=1.0, sigma=1.5, bounce=0.4):
+    rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    u = 30 + 3 * columns + 0.3 * rows
+    inside = (abs(rows - 20) < 8) & (abs(columns - 30) < 10)
+    grey = [
+        8
+        + 80 * (0.5 + 0.5 * np.cos(2 * np.pi * frequency * u + s)) ** gamma
+        + 80 * bounce * inside * (0.5 + 0.5 * np.cos(2 * np.pi * frequency * (300 - 0.8 * u) + s)) ** gamma
+        for s in phase_steps("x", frequency, steps).steps_rad
+    ]
+    return np.rint(np.stack(grey) + random.normal(0, sigma, (steps, *SHAPE)))
+
+
+def shown(frames, frequency, sigma=1.5):
+    steps = phase_steps("x", frequency, len(frames)).steps_rad
+    z = grid(SHAPE).take_all(frames.astype(np.float32)).T @ (2 / len(steps) * np.exp(-1j * steps))
+    sigma_z = sigma * np.sqrt(2 / len(steps))
+    return Shown("x", frequency, z.astype(np.complex64), sigma_z, np.abs(z) > 8 * sigma_z, 1)
+
+
+def odds(sequences):
+    return standing_out(sequences, EXTENT, grid(SHAPE))
+
+
+@pytest.mark.parametrize(
+    ("frequencies", "steps", "gamma"),
+    [(MICRO, 3, 1.0), (MICRO, 4, 2.2), (MICRO, 12, 2.2), (TEMPORAL, 3, 1.0), (TEMPORAL, 12, 2.2)],
+)
+@pytest.mark.parametrize("bounce", [0.0, 0.5])
+def test_good_rounds_agree(frequencies, steps, gamma, bounce):
+    for seed in range(3):
+        random = np.random.default_rng(seed)
+        good = [shown(frames_of(f, steps, random, gamma, bounce=bounce), f) for f in frequencies]
+        assert odds(good).max() == 0
+
+
+@pytest.mark.parametrize("frequencies", [MICRO, TEMPORAL])
+@pytest.mark.parametrize("steps", [3, 12])
+@pytest.mark.parametrize("ratio", [0.2, 1.0])
+def test_light_that_flickers_in_one_frame(frequencies, steps, ratio):
+    # (2/N) (e/B) / √2 is the rms error of the phase, √(2/N) σ/B its noise.
+    excess = ratio * 1.5 * np.sqrt(steps)
+    random = np.random.default_rng(5)
+    sequences = []
+    for t, f in enumerate(frequencies):
+        frames = frames_of(f, steps, random)
+        frames[1] += excess * (t == 2)
+        sequences.append(shown(frames, f))
+    found = odds(sequences)
+    if ratio < 0.5:
+        assert found.max() == 0
+    else:
+        assert found.argmax() == 2
+        assert found[2] > 1
+
+
+def test_some_rows_of_one_frame():
+    random = np.random.default_rng(6)
+    sequences = []
+    for t, f in enumerate(MICRO):
+        frames = frames_of(f, 12, random)
+        # Half of the former picture in a sixth of the rows.
+        if t == 4:
+            frames[3, 32:40] = (frames[3, 32:40] + frames[2, 32:40]) / 2
+        sequences.append(shown(frames, f))
+    found = odds(sequences)
+    assert found.argmax() == 4
+    assert found[4] > 1
+
+
+def test_the_former_sequence_in_the_first_frame():
+    # Its fringes go the other way, so that none of this sequence's own shapes explains them.
+    random = np.random.default_rng(7)
+    former = np.broadcast_to(60 + 40 * np.cos(2 * np.pi * np.arange(SHAPE[0]) / 11)[:, None], SHAPE)
+    sequences = []
+    for t, f in enumerate(MICRO):
+        frames = frames_of(f, 6, random)
+        if t == 0:
+            frames[0] += 0.08 * (former - frames[0])
+        one = shown(frames, f)
+        last = grid(SHAPE).take(former) if t == 0 else None
+        sequences.append(Shown(one.axis, one.frequency, one.z, one.sigma_z, one.usable, 1, last))
+    found = odds(sequences)
+    assert found.argmax() == 0
+    assert found[0] > 1
+
+
+def test_of_three_frequencies_one_that_began_a_step_late_is_at_odds():
+    # Unwrapping needs all three; the wrong phase is absorbed by other fringe orders, but for a small rest.
+    random = np.random.default_rng(8)
+    good = [frames_of(f, 12, random) for f in TEMPORAL]
+    good[2] = np.roll(good[2], 1, axis=0)
+    assert odds([shown(frames, f) for frames, f in zip(good, TEMPORAL, strict=True)]).max() > 1
+
+
+def test_two_takes_are_the_same_or_not():
+    random = np.random.default_rng(9)
+    first, second = (frames_of(MICRO[0], 6, random) for _ in range(2))
+    assert same(shown(first, MICRO[0]), shown(second, MICRO[0]))
+    second[2] += 1.5 * 1.5 * np.sqrt(6)
+    assert not same(shown(first, MICRO[0]), shown(second, MICRO[0]))
