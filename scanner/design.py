@@ -380,9 +380,7 @@ def _choose(candidates: _Candidates, count: int, steps: int, dof: int) -> tuple[
     return next((candidates.frequencies(c) for c in ranked if candidates.told(c, steps)), None)
 
 
-def _exchanged(
-    start: NDArray[np.intp], many: int, cost: Callable[[NDArray[np.intp]], float]
-) -> NDArray[np.intp]:
+def _exchanged(start: NDArray[np.intp], many: int, cost: Callable[[NDArray[np.intp]], float]) -> NDArray[np.intp]:
     """Coordinate exchange (Meyer and Nachtsheim, Technometrics 37, 60 (1995)): one frequency at a time, while it helps."""
     best, lowest = start, cost(start)
     improved = True

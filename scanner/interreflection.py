@@ -20,13 +20,13 @@ from scipy.stats import chi2 as chi2_distribution
 
 from scanner.labelling import BOUNDARY_PRICE, label
 from scanner.phasors import AxisPhasors
-from scanner.pooling import Spectra, pool
+from scanner.pooling import Residuals, Spectra, pool
 from scanner.unwrapping import Coordinates
 
 _SMALLEST_REGION = 12
 """Fewer connected pixels than this are no region: nothing that a second round could light."""
 
-_MOST_EVIDENCE = 3 * BOUNDARY_PRICE
+MOST_EVIDENCE = 3 * BOUNDARY_PRICE
 """A single pixel never says more than its own boundary costs: no region stands on one pixel."""
 
 _EDGE_REACH = 3
@@ -135,7 +135,7 @@ def detect(
 
 
 def detect_pooled(
-    residuals: Sequence[NDArray[np.complex64]],
+    residuals: Sequence[Residuals],
     statistic: NDArray[np.float32],
     dof: int,
     coordinates: Sequence[Coordinates],
@@ -147,7 +147,7 @@ def detect_pooled(
     Parameters
     ----------
     residuals
-        (T, H, W) of each axis, from `scanner.pooling.one_path_residuals`.
+        Of each axis, from `scanner.pooling.one_path_residuals`.
     statistic, dof, coordinates, usable, false_alarm_rate
         As for `detect`; the statistic is χ² of the one-path fits.
 
@@ -165,7 +165,7 @@ def detect_pooled(
     found, start = np.zeros(usable.shape, bool), None
     for _ in range(2):
         pooled = pool(residuals, statistic, dof, usable, false_alarm_rate, excess, spectra)
-        evidence = np.clip(pooled.evidence, -_MOST_EVIDENCE, _MOST_EVIDENCE)
+        evidence = np.clip(pooled.evidence, -MOST_EVIDENCE, MOST_EVIDENCE)
         start = label(evidence, start=start)
         found = usable & (start > 0.5)
         before, excess = excess, max(1.0, excess_misfit(statistic, dof, usable & ~found))

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -47,6 +48,10 @@ speak for a window."""
 
 _QUARTILE_WINDOWS = 200
 """So many windows at least tell which waves all clean surfaces have in common."""
+
+_LEAST_RATIO = 0.005
+"""Waves weaker than this part of the direct light are put down to the patterns: an 8-bit projector's rounding alone is
+0.2 % of the amplitude, and no fringe is a pure cosine. A bounce so weak moves a coordinate by 0.005/2π of a period."""
 
 _FEWEST = 12
 """A wave is known from so many pixels at least."""
@@ -78,6 +83,23 @@ class Pooled:
 
 
 @dataclass(frozen=True)
+class Residuals:
+    """What the one-path fits of one axis leave.
+
+    Parameters
+    ----------
+    e
+        (T, H, W) turned back by the fitted phase, in units of the noise: real and imaginary parts of variance 1 under
+        noise alone, on 2T - 2 degrees of freedom. Unusable pixels are 0.
+    systematic
+        (H, W) power per pixel, in the same units, that the frames may have in one wave without any bounce.
+    """
+
+    e: NDArray[np.complex64]
+    systematic: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
 class _Windows:
     """Where the windows begin, and of every row and column the first and the last window that covers it."""
 
@@ -98,6 +120,14 @@ class _Windows:
     def shape(self) -> tuple[int, int]:
         return len(self.rows), len(self.columns)
 
+    def sums(self, values: NDArray[Any]) -> NDArray[np.float32]:
+        """(n, m) sum of (H, W) values over every window."""
+        result = np.zeros(self.shape, np.float32)
+        for i, y in enumerate(self.rows):
+            total = np.concatenate(([0.0], np.cumsum(values[y : y + WINDOW].sum(axis=0, dtype=np.float64))))
+            result[i] = total[self.columns + WINDOW] - total[self.columns]
+        return result
+
 
 @dataclass(frozen=True)
 class Spectra:
@@ -111,6 +141,8 @@ class Spectra:
         (n, m) bool, windows with enough usable pixels.
     power
         (n, m, bins) by axis, summed over t, per usable pixel: χ² with ``dof`` degrees of freedom under noise.
+    systematic
+        (n, m) by axis, what a bin may hold without a bounce.
     dof
         By axis.
     """
@@ -118,28 +150,29 @@ class Spectra:
     windows: _Windows
     asked: NDArray[np.bool_]
     power: tuple[NDArray[np.float32], ...]
+    systematic: tuple[NDArray[np.float32], ...]
     dof: tuple[int, ...]
 
     @classmethod
-    def of(cls, residuals: Sequence[NDArray[np.complex64]], usable: NDArray[np.bool_]) -> Spectra:
-        """Transform the residuals (T, H, W) of each axis; ``usable`` (H, W)."""
+    def of(cls, residuals: Sequence[Residuals], usable: NDArray[np.bool_]) -> Spectra:
+        """Transform the residuals of each axis; ``usable`` (H, W)."""
         windows = _Windows.over(usable.shape)
-        count = np.zeros(windows.shape, np.float32)
-        for i, y in enumerate(windows.rows):
-            band = usable[y : y + WINDOW].sum(axis=0, dtype=np.int32)
-            total = np.concatenate(([0], np.cumsum(band)))
-            count[i] = total[windows.columns + WINDOW] - total[windows.columns]
-        power = tuple(_spectra(e, windows) / np.maximum(count, 1)[..., None] for e in residuals)
-        return cls(windows, count >= _LEAST_SHARE * _BINS, power, tuple(2 * len(e) - 2 for e in residuals))
+        count = windows.sums(usable)
+        power = tuple(_spectra(r.e, windows) / np.maximum(count, 1)[..., None] for r in residuals)
+        systematic = tuple(windows.sums(r.systematic) for r in residuals)
+        return cls(
+            windows, count >= _LEAST_SHARE * _BINS, power, systematic, tuple(2 * len(r.e) - 2 for r in residuals)
+        )
 
     def p_values(self, excess_noise: np.float32) -> tuple[NDArray[np.float64], list[NDArray[np.intp]]]:
         """P-value (n, m) of the windows' strongest bins, the axes joined by Fisher's method; and those bins by axis."""
         surprise, peaks = np.zeros(self.windows.shape), []
-        for raw, dof in zip(self.power, self.dof, strict=True):
+        for raw, systematic, dof in zip(self.power, self.systematic, self.dof, strict=True):
             power = raw / excess_noise
             power /= _common_waves(power[self.asked], dof)
             peak = power.argmax(axis=-1)
             strongest = np.take_along_axis(power, peak[..., None], axis=-1)[..., 0]
+            strongest = np.maximum(strongest - systematic / excess_noise, 0)
             one = chi2_distribution.sf(strongest, dof)
             surprise -= 2 * np.log(np.maximum(-np.expm1(_BINS * np.log1p(-np.minimum(one, 1 - 1e-12))), 1e-300))
             peaks.append(peak)
@@ -152,10 +185,14 @@ def one_path_residuals(
     sigma_z: NDArray[np.float32],
     gain: NDArray[np.float64],
     usable: NDArray[np.bool_],
-) -> NDArray[np.complex64]:
-    """(T, H, W) what the one-path fit leaves, turned back by the fitted phase, in units of the noise.
+) -> Residuals:
+    """Residuals of the one-path fits ``coordinates`` of ``phasors``; the arguments are those of `unwrap`.
 
-    Noise alone gives real and imaginary parts of variance 1, on 2T - 2 degrees of freedom. Unusable pixels are 0.
+    Notes
+    -----
+    Two errors follow the fringes and therefore the surface, like a bounce: those of the patterns, in proportion to the
+    light, and the rounding of the frames where no noise dithers it. Noise of σ DN leaves exp(-2π²σ²) of the latter
+    (Widrow and Kollár, *Quantization Noise*, §19).
     """
     count = len(phasors.frequency)
     result = np.empty(phasors.z.shape, np.complex64)
@@ -164,11 +201,15 @@ def one_path_residuals(
     f, g = phasors.frequency.astype(np.float32), gain.astype(np.float32)
     z, out = phasors.z.reshape(count, -1), result.reshape(count, -1)
     over_pixels(lambda a, b: _residuals(z, f, g, *flat, most, out, a, b), z.shape[1])
-    return result
+    variance = sigma_z**2 / np.float32(phasors.noise_gain)
+    undithered = np.exp(-4 * np.pi**2 * np.maximum(variance - np.float32(1 / 12), 0))
+    systematic = count * (_LEAST_RATIO * coordinates.amplitude / sigma_z) ** 2
+    systematic += (2 * count - 2) * undithered / (12 * variance)
+    return Residuals(result, np.where(usable, systematic, 0).astype(np.float32))
 
 
 def pool(
-    residuals: Sequence[NDArray[np.complex64]],
+    residuals: Sequence[Residuals],
     statistic: NDArray[np.float32],
     dof: int,
     usable: NDArray[np.bool_],
@@ -181,7 +222,7 @@ def pool(
     Parameters
     ----------
     residuals
-        (T, H, W) of each axis, from `one_path_residuals`.
+        Of each axis, from `one_path_residuals`.
     statistic, dof
         (H, W) χ² of the one-path fits of all axes together, and its degrees of freedom under noise.
     usable
@@ -225,7 +266,7 @@ def single_pixel_evidence(statistic: NDArray[np.float32], dof: int, false_alarm_
     """
     threshold = float(chi2_distribution.isf(false_alarm_rate, dof))
     grid = np.linspace(0.05, 8 * threshold, 4000)
-    ratio = ncx2.logpdf(grid, dof, threshold - dof) - chi2_distribution.logpdf(grid, dof)
+    ratio = ncx2.logpdf(grid, dof, max(threshold - dof, dof**0.5)) - chi2_distribution.logpdf(grid, dof)
     known = np.isfinite(ratio)
     return np.interp(statistic, grid[known], ratio[known]).astype(np.float32)
 
@@ -266,7 +307,7 @@ def _common_waves(power: NDArray[np.float32], dof: int) -> NDArray[np.float32]:
 
 
 def _evidence(
-    residuals: Sequence[NDArray[np.complex64]],
+    residuals: Sequence[Residuals],
     windows: _Windows,
     asked: NDArray[np.bool_],
     peaks: Sequence[NDArray[np.intp]],
@@ -277,7 +318,8 @@ def _evidence(
     """Evidence of every pixel: of the waves of its windows, or of its own χ² where that says more."""
     pooled = np.zeros(weights.shape, np.float32)
     reached = np.zeros(weights.shape, bool)
-    for e, peak in zip(residuals, peaks, strict=True):
+    for found, peak in zip(residuals, peaks, strict=True):
+        e = found.e
         count = len(e)
         waves = np.zeros((*windows.shape, count), np.complex64)
         place = np.zeros((*windows.shape, 2), np.float32)
