@@ -1,4 +1,4 @@
-"""The command line: `scan`, and `process`, `compare`, `plan`, `study`, `doctor`, `preview`, `latency`, `schema` below it.
+"""The command line: `scan`, and `process`, `compare`, `plan`, `study`, `doctor`, `preview`, `latency`, `schema` below.
 
 Exit codes: 0 done; 2 bad configuration or usage; 3 hardware; 4 the scan ran but its result fails its own quality gates;
 130 interrupted. Everything heavy is imported where it is used, so that `scan --help` answers at once.
@@ -208,6 +208,7 @@ def plan(
     noise_dn: Annotated[float, typer.Option("--noise-dn", help="Standard deviation of a frame's noise, DN.")] = 1.5,
     modulation_dn: Annotated[float, typer.Option("--modulation-dn", help="Fringe modulation B, DN.")] = 80,
     false_alarm_rate: Annotated[float, typer.Option("--false-alarm-rate", help="Of the detection, 0..1.")] = 0.01,
+    alpha: Annotated[float, typer.Option("--alpha", help="Bounce over direct light, for the table's power.")] = 0.05,
     axes: Annotated[str, typer.Option("--axes", help="x, y or x,y.")] = "x,y",
     min_steps: Annotated[int, typer.Option("--min-steps", help="Fewest phase steps; from 4 on, faults show.")] = 4,
     max_steps: Annotated[int, typer.Option("--max-steps", help="Most phase steps.")] = 12,
@@ -255,7 +256,7 @@ def plan(
                 {"chosen": plan_rows([chosen])[0], "paper": plan_rows([usual])[0], "trade": plan_rows(plans)},
             )
     console = Console(highlight=False, soft_wrap=True)
-    console.print(plan_table(chosen, usual, plans))
+    console.print(plan_table(chosen, usual, plans, alpha))
     console.print("\nscan:\n" + chosen.yaml(), markup=False)
 
 

@@ -174,6 +174,14 @@ class DesignedPlan:
         """Probability of a wrong order on the worse axis."""
         return max(b.wrong_orders for b in self.bounds.values())
 
+    def power(self, alpha: float) -> tuple[float, float]:
+        """Share of bounces of amplitude ratio ``alpha`` that are detected: mean over Δu and axes, and worst."""
+        dof = sum(2 * len(f) - 2 for f in self.frequencies.values())
+        rate = self.demand.false_alarm_rate
+        least = np.concatenate([b.least_bounce for b in self.bounds.values()])
+        found = detection_power(even_noncentrality(dof, rate) * (alpha / least) ** 2, dof, rate)
+        return float(found.mean()), float(found.min())
+
     def plan(self) -> Plan:
         """Make the plan of one round."""
         return Plan(
@@ -333,7 +341,7 @@ def _least_bounce(one: Floats, demand: Demand, dof: int) -> Floats:
 
 
 class _Candidates:
-    """All fringes that one axis may have, with what every one adds to the sums of the bounds: a choice is then cheap."""
+    """All fringes that one axis may have, with what each adds to the sums of the bounds."""
 
     def __init__(self, demand: Demand, axis: Axis) -> None:
         self.demand, self.extent, self.orders = demand, demand.extent(axis), demand.orders(axis)
@@ -381,7 +389,7 @@ def _choose(candidates: _Candidates, count: int, steps: int, dof: int) -> tuple[
 
 
 def _exchanged(start: NDArray[np.intp], many: int, cost: Callable[[NDArray[np.intp]], float]) -> NDArray[np.intp]:
-    """Coordinate exchange (Meyer and Nachtsheim, Technometrics 37, 60 (1995)): one frequency at a time, while it helps."""
+    """Exchange one candidate at a time while it helps (Meyer and Nachtsheim, Technometrics 37, 60 (1995))."""
     best, lowest = start, cost(start)
     improved = True
     while improved:

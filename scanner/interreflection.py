@@ -4,8 +4,8 @@ Three detectors are offered. *variation* is the paper's: the standard deviation 
 *misfit* is χ² of the one-path fit to the complex phasors; it uses the phase too and sees several times weaker bounces.
 *pooled* asks the neighbours as well (`scanner.pooling`) and joins the evidence of single pixels (`scanner.labelling`);
 it sees bounces far below the noise of a pixel. All are compared with their distribution under noise alone, so that the
-operator chooses a false-alarm rate and never a grey level. Depth edges, which mix two surfaces in one pixel, look the same to either and are told apart by the
-surfaces beside them.
+operator chooses a false-alarm rate and never a grey level. Depth edges, which mix two surfaces in one pixel, look the
+same to each and are told apart by the surfaces beside them.
 """
 
 from __future__ import annotations

@@ -30,6 +30,7 @@ from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import ncx2
 
 from scanner.kernels import over_pixels, over_rows, sin_cos_turns
+from scanner.labelling import label
 from scanner.phasors import AxisPhasors
 from scanner.unwrapping import Coordinates
 
@@ -49,9 +50,9 @@ speak for a window."""
 _QUARTILE_WINDOWS = 200
 """So many windows at least tell which waves all clean surfaces have in common."""
 
-_LEAST_RATIO = 0.005
-"""Waves weaker than this part of the direct light are put down to the patterns: an 8-bit projector's rounding alone is
-0.2 % of the amplitude, and no fringe is a pure cosine. A bounce so weak moves a coordinate by 0.005/2π of a period."""
+_LEAST_RATIO = 0.001
+"""Waves weaker than this part of the direct light are put down to the patterns: 8-bit rounding is 0.2 % of a fringe's
+amplitude, of which twelve steps leave half. A bounce so weak moves a coordinate by 0.001/2π of a period."""
 
 _FEWEST = 12
 """A wave is known from so many pixels at least."""
@@ -158,7 +159,8 @@ class Spectra:
         """Transform the residuals of each axis; ``usable`` (H, W)."""
         windows = _Windows.over(usable.shape)
         count = windows.sums(usable)
-        power = tuple(_spectra(r.e, windows) / np.maximum(count, 1)[..., None] for r in residuals)
+        each = np.maximum(count, np.float32(1))[..., None]
+        power = tuple(_spectra(r.e, windows) / each for r in residuals)
         systematic = tuple(windows.sums(r.systematic) for r in residuals)
         return cls(
             windows, count >= _LEAST_SHARE * _BINS, power, systematic, tuple(2 * len(r.e) - 2 for r in residuals)
@@ -197,10 +199,11 @@ def one_path_residuals(
     count = len(phasors.frequency)
     result = np.empty(phasors.z.shape, np.complex64)
     most = np.float32(chi2_distribution.isf(_OUTLIER_RATE, 2 * count - 2))
-    flat = [np.ascontiguousarray(a).reshape(-1) for a in (coordinates.u, coordinates.amplitude, sigma_z, usable)]
+    planes = (coordinates.u, coordinates.amplitude, sigma_z, usable)
+    u, amplitude, sigma, asked = (np.ascontiguousarray(a).reshape(-1) for a in planes)
     f, g = phasors.frequency.astype(np.float32), gain.astype(np.float32)
     z, out = phasors.z.reshape(count, -1), result.reshape(count, -1)
-    over_pixels(lambda a, b: _residuals(z, f, g, *flat, most, out, a, b), z.shape[1])
+    over_pixels(lambda a, b: _residuals(z, f, g, u, amplitude, sigma, asked, most, out, a, b), z.shape[1])
     variance = sigma_z**2 / np.float32(phasors.noise_gain)
     undithered = np.exp(-4 * np.pi**2 * np.maximum(variance - np.float32(1 / 12), 0))
     systematic = count * (_LEAST_RATIO * coordinates.amplitude / sigma_z) ** 2
@@ -268,7 +271,7 @@ def single_pixel_evidence(statistic: NDArray[np.float32], dof: int, false_alarm_
     grid = np.linspace(0.05, 8 * threshold, 4000)
     ratio = ncx2.logpdf(grid, dof, max(threshold - dof, dof**0.5)) - chi2_distribution.logpdf(grid, dof)
     known = np.isfinite(ratio)
-    return np.interp(statistic, grid[known], ratio[known]).astype(np.float32)
+    return np.asarray(np.interp(statistic, grid[known], ratio[known]), np.float32)
 
 
 def _spectra(e: NDArray[np.complex64], windows: _Windows) -> NDArray[np.float32]:
@@ -345,6 +348,17 @@ def _evidence(
             len(weights),
         )
     return np.where(reached, np.maximum(pooled / excess_noise, alone), alone)
+
+
+def compile_all() -> None:
+    """Compile the kernels of pooling and labelling, so that no scan waits for them."""
+    side = 2 * WINDOW
+    z = np.ones((3, side, side), np.complex64)
+    plane, usable = np.ones((side, side), np.float32), np.ones((side, side), bool)
+    phasors = AxisPhasors("x", np.array([1 / 16, 1 / 17, 1 / 18]), z, 1.0)
+    coordinates = Coordinates("x", plane, plane, plane, plane, 4, plane)
+    residuals = one_path_residuals(phasors, coordinates, plane, np.ones(3), usable)
+    label(pool([residuals], plane, 4, usable, 0.4).evidence, iterations=1)
 
 
 def _covering(starts: NDArray[np.intp], length: int) -> NDArray[np.intp]:

@@ -25,22 +25,32 @@ if TYPE_CHECKING:
 _PLAIN_EVERY_S = 2.0
 
 
-def plan_table(chosen: DesignedPlan, usual: DesignedPlan, plans: Sequence[DesignedPlan]) -> Table:
+def plan_table(chosen: DesignedPlan, usual: DesignedPlan, plans: Sequence[DesignedPlan], alpha: float) -> Table:
     """Show what frames buy: designed plans of several budgets, and the paper's."""
-    table = Table(title="frames against error and detection, bounds of one pixel", title_justify="left", pad_edge=False)
-    for name in ("plan", "frames", "frequencies", "steps", "σ_u, px", "wrong orders", "α₅₀ typical", "α₅₀ worst"):
-        table.add_column(name, justify="left" if name == "plan" else "right")
+    title = (
+        f"what frames buy: bounds of one pixel; power: bounces of α = {alpha:g} that χ² finds, mean and worst over Δu"
+    )
+    table = Table(title=title, title_justify="left", pad_edge=False)
+    for name in ("plan", "frames", "f", "steps", "σ_u, px", "wrong order", "power", "worst", "α₅₀", "worst α₅₀"):
+        table.add_column(name, justify="left" if name == "plan" else "right", no_wrap=True)
     for name, plan in (("paper", usual), *(("designed", p) for p in plans)):
+        mean, worst = plan.power(alpha)
         table.add_row(
             "chosen" if plan.frame_count == chosen.frame_count and name == "designed" else name,
             str(plan.frame_count),
-            " + ".join(str(len(f)) for f in plan.frequencies.values()),
+            "+".join(str(len(f)) for f in plan.frequencies.values()),
             str(plan.steps),
             f"{plan.sigma_px:.4f}",
-            f"{plan.wrong_orders:.1e}",
+            f"{plan.wrong_orders:.0e}" if plan.wrong_orders > 1e-9 else "<1e-9",
+            f"{mean:.3f}",
+            f"{worst:.3f}",
             f"{plan.typical_bounce:.3f}",
             f"{plan.worst_bounce:.3f}",
         )
+    table.caption = (
+        "f: frequencies by axis; α₅₀: the bounce that is found every other time, by its part of the direct light"
+    )
+    table.caption_justify = "left"
     return table
 
 

@@ -1,7 +1,8 @@
-"""Detection at the limit: how weak a bounce, under how much noise, at which Δu (Optics Express 27(20) 28293, Figs. 22, 23).
+"""Detection at the limit: how weak a bounce, under how much noise, at which distance of the two paths.
 
-Three detectors at one false-alarm rate: the paper's standard deviation of the modulation, χ² of the one-path fit, and χ²
-pooled over neighbours. Every figure comes with the 95 % interval over independent seeds.
+The study of Optics Express 27(20) 28293, Figs. 22 and 23, with three detectors at one false-alarm rate: the paper's
+standard deviation of the modulation, χ² of the one-path fit, and χ² pooled over neighbours. Every figure comes with the
+95 % interval over independent seeds.
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ def score(scene: IdealScene, judged: Judgement, near_px: float = NEAR_PX) -> Sco
 
 
 def area_under_roc(positive: NDArray[Any], negative: NDArray[Any]) -> float:
-    """Probability that a positive scores above a negative (Mann-Whitney), ties counted half; NaN where one is missing."""
+    """Probability that a positive scores above a negative (Mann-Whitney), ties counted half; NaN where none is."""
     if not positive.size or not negative.size:
         return float("nan")
     ranks = rankdata(np.concatenate([positive.ravel(), negative.ravel()]))
@@ -144,7 +145,8 @@ def pairs_study(
     examples
         Scene and judgements of the first seed by pair, for figures.
     """
-    rows, examples = [], {}
+    rows: list[dict[str, Any]] = []
+    examples: dict[tuple[float, float], tuple[IdealScene, dict[str, Judgement]]] = {}
     for alpha, sigma in pairs:
         report(f"α = {alpha:g}, σ = {sigma:g} DN")
         scores: dict[str, list[Score]] = {d: [] for d in DETECTORS}

@@ -1,7 +1,7 @@
 """Ideal frames: fringes of two paths and Gaussian noise, without a scene, optics or a camera.
 
-``I = A + B cos(2πf u + φ_n) + α [A + B cos(2πf (u + Δu) + φ_n)] + noise``, as Optics Express 27(20) 28293 simulates in its
-Figs. 22 and 23, with A = B = 80 DN.
+``I = A + B cos(2πf u + φ_n) + α [A + B cos(2πf (u + Δu) + φ_n)] + noise``, as Optics Express 27(20) 28293 simulates in
+its Figs. 22 and 23, with A = B = 80 DN.
 """
 
 from __future__ import annotations

@@ -177,12 +177,14 @@ def test_half_the_frames_on_a_mirror_scene(scan_simulated):
             "recall": hits.sum() / region.sum(),
             "precision": hits.sum() / (maps.interreflection & direct).sum(),
             "error": error[clean].mean(),
+            "bound": np.nanmean(maps.sigma_x[clean]),
             "good": (inside < 0.25).mean() * inside.size / region.sum(),
         }
+    print(found)
     assert found["half"]["recall"] >= found["paper"]["recall"] - 0.01
     assert found["half"]["precision"] >= found["paper"]["precision"] - 0.01
     assert found["half"]["error"] <= 1.5 * found["paper"]["error"]
-    assert found["half"]["good"] >= 0.95
+    assert found["half"]["good"] >= found["paper"]["good"] - 0.02
 
 
 def test_judging_the_papers_plan_gives_method_mds_bound():
