@@ -5,7 +5,7 @@ path: ``e_t = a₂ e^{i2πf_t Δu}`` less what the fit took. From pixel to pixel
 on a smooth surface it changes evenly: inside a small window the residuals are the samples of a plane wave with one
 unknown vector over t,
 
-    e_t(p) ≈ s_t e^{i k·p} + noise.
+    e_t(p) ≈ s_t e^{i k·p} + noise,   k = 2πf ∇Δu, nearly the same for all frequencies.
 
 The Fourier transform of a window collects such a wave in one bin (the generalised likelihood ratio test for a signal
 linear in its unknown amplitudes: Kay, *Fundamentals of Statistical Signal Processing II: Detection Theory*, §7.6): of M
@@ -94,10 +94,13 @@ class Residuals:
         noise alone, on 2T - 2 degrees of freedom. Unusable pixels are 0.
     systematic
         (H, W) power per pixel, in the same units, that the frames may have in one wave without any bounce.
+    frequency
+        (T,) 1/px; the waves of the frequencies have spatial frequencies in proportion.
     """
 
     e: NDArray[np.complex64]
     systematic: NDArray[np.float32]
+    frequency: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -160,7 +163,7 @@ class Spectra:
         windows = _Windows.over(usable.shape)
         count = windows.sums(usable)
         each = np.maximum(count, np.float32(1))[..., None]
-        power = tuple(_spectra(r.e, windows) / each for r in residuals)
+        power = tuple(np.asarray(_spectra(r.e, windows) / each, np.float32) for r in residuals)
         systematic = tuple(windows.sums(r.systematic) for r in residuals)
         return cls(
             windows, count >= _LEAST_SHARE * _BINS, power, systematic, tuple(2 * len(r.e) - 2 for r in residuals)
@@ -208,7 +211,7 @@ def one_path_residuals(
     undithered = np.exp(-4 * np.pi**2 * np.maximum(variance - np.float32(1 / 12), 0))
     systematic = count * (_LEAST_RATIO * coordinates.amplitude / sigma_z) ** 2
     systematic += (2 * count - 2) * undithered / (12 * variance)
-    return Residuals(result, np.where(usable, systematic, 0).astype(np.float32))
+    return Residuals(result, np.where(usable, systematic, 0).astype(np.float32), phasors.frequency)
 
 
 def pool(
@@ -322,16 +325,17 @@ def _evidence(
     pooled = np.zeros(weights.shape, np.float32)
     reached = np.zeros(weights.shape, bool)
     for found, peak in zip(residuals, peaks, strict=True):
-        e = found.e
-        count = len(e)
+        e, count = found.e, len(found.e)
+        ratio = (found.frequency / found.frequency.mean()).astype(np.float32)
         waves = np.zeros((*windows.shape, count), np.complex64)
         place = np.zeros((*windows.shape, 2), np.float32)
         members = np.zeros(windows.shape, np.float32)
         arrays = windows.rows, windows.columns, asked, peak
-        over_rows(lambda a, b: _fit_waves(e, weights, *arrays, waves, place, members, a, b), windows.shape[0])  # noqa: B023
+        over_rows(lambda a, b: _fit_waves(e, ratio, weights, *arrays, waves, place, members, a, b), windows.shape[0])  # noqa: B023
         over_rows(
             lambda a, b: _predict(
                 e,  # noqa: B023
+                ratio,  # noqa: B023
                 weights,
                 windows.rows,
                 windows.columns,
@@ -391,7 +395,7 @@ def _residuals(z, frequency, gain, u, amplitude, sigma, usable, most, out, start
 
 
 @_compiled
-def _fit_waves(e, weights, rows, columns, asked, peak, waves, place, members, start, stop):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _fit_waves(e, ratio, weights, rows, columns, asked, peak, waves, place, members, start, stop):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Spatial frequency (turns per px, down and across) and vector over t of the wave of every asked window."""
     count = e.shape[0]
     fractions = _FRACTIONS.size
@@ -408,15 +412,18 @@ def _fit_waves(e, weights, rows, columns, asked, peak, waves, place, members, st
             if total < _FEWEST:
                 continue
             ky, kx = peak[i, j] // WINDOW, peak[i, j] % WINDOW
+            # The smallest of the spatial frequencies that the pixels cannot tell apart.
+            ky = ky - WINDOW if ky > WINDOW // 2 else ky
+            kx = kx - WINDOW if kx > WINDOW // 2 else kx
             for a in range(fractions):
                 turns = (np.float32(kx) + _FRACTIONS[a]) / np.float32(WINDOW)
                 for t in range(count):
                     for y in range(WINDOW):
                         lines[a, t, y] = 0
-                for x in range(WINDOW):
-                    s, c = sin_cos_turns(turns * np.float32(x))
-                    back = np.complex64(complex(c, -s))
-                    for t in range(count):
+                for t in range(count):
+                    for x in range(WINDOW):
+                        s, c = sin_cos_turns(turns * ratio[t] * np.float32(x))
+                        back = np.complex64(complex(c, -s))
                         for y in range(WINDOW):
                             lines[a, t, y] += weights[y0 + y, x0 + x] * e[t, y0 + y, x0 + x] * back
             best = np.float32(-1.0)
@@ -427,7 +434,7 @@ def _fit_waves(e, weights, rows, columns, asked, peak, waves, place, members, st
                     for t in range(count):
                         re, im = np.float32(0.0), np.float32(0.0)
                         for y in range(WINDOW):
-                            s, c = sin_cos_turns(turns * np.float32(y))
+                            s, c = sin_cos_turns(turns * ratio[t] * np.float32(y))
                             value = lines[a, t, y]
                             re += value.real * c + value.imag * s
                             im += value.imag * c - value.real * s
@@ -439,7 +446,7 @@ def _fit_waves(e, weights, rows, columns, asked, peak, waves, place, members, st
                         for t in range(count):
                             re, im = np.float32(0.0), np.float32(0.0)
                             for y in range(WINDOW):
-                                s, c = sin_cos_turns(turns * np.float32(y))
+                                s, c = sin_cos_turns(turns * ratio[t] * np.float32(y))
                                 value = lines[a, t, y]
                                 re += value.real * c + value.imag * s
                                 im += value.imag * c - value.real * s
@@ -448,7 +455,9 @@ def _fit_waves(e, weights, rows, columns, asked, peak, waves, place, members, st
 
 
 @_compiled
-def _predict(e, weights, rows, columns, row_range, column_range, waves, place, members, evidence, reached, start, stop):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def _predict(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    e, ratio, weights, rows, columns, row_range, column_range, waves, place, members, evidence, reached, start, stop
+):
     """Add the evidence of one axis: Re<prediction, pixel> - |prediction|²/2, by the strongest wave over the pixel."""
     count = e.shape[0]
     for y in range(start, stop):
@@ -468,11 +477,11 @@ def _predict(e, weights, rows, columns, row_range, column_range, waves, place, m
             turns = place[at_i, at_j, 0] * np.float32(y - rows[at_i]) + place[at_i, at_j, 1] * np.float32(
                 x - columns[at_j]
             )
-            s, c = sin_cos_turns(turns)
             own = weights[y, x]
             others = max(members[at_i, at_j] - own, np.float32(1.0))
             product, length = np.float32(0.0), np.float32(0.0)
             for t in range(count):
+                s, c = sin_cos_turns(turns * ratio[t])
                 re = e[t, y, x].real * c + e[t, y, x].imag * s
                 im = e[t, y, x].imag * c - e[t, y, x].real * s
                 mean_re = (waves[at_i, at_j, t].real - own * re) / others

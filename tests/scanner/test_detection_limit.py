@@ -109,7 +109,7 @@ def test_a_windows_p_value_is_one():
     values = []
     for seed in range(6):
         _, residuals, usable = _residuals((128, 160), 20 + seed)
-        pure = Residuals(residuals.e, np.zeros(usable.shape, np.float32))
+        pure = Residuals(residuals.e, np.zeros(usable.shape, np.float32), residuals.frequency)
         found, _ = Spectra.of([pure], usable).p_values(np.float32(1))
         values.append(found[::2, ::2].ravel())
     assert kstest(np.concatenate(values), "uniform").pvalue > 1e-3
@@ -125,7 +125,7 @@ def test_evidence_of_a_plane_wave_is_its_likelihood_ratio():
     noise = rng.standard_normal((9, *shape)) + 1j * rng.standard_normal((9, *shape))
     e = (vector + noise).astype(np.complex64)
     statistic = (np.abs(e) ** 2).sum(axis=0).astype(np.float32)
-    found = pool([Residuals(e, np.zeros(shape, np.float32))], statistic, 18, usable, 0.01)
+    found = pool([Residuals(e, np.zeros(shape, np.float32), np.ones(9))], statistic, 18, usable, 0.01)
     true = (vector.conj() * e).real.sum(axis=0) - 0.5 * (np.abs(vector) ** 2).sum(axis=0)
     alone = single_pixel_evidence(statistic, 18, 0.01)
     pooled = found.evidence > alone
