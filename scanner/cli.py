@@ -1,4 +1,4 @@
-"""The command line: `scan`, and `process`, `compare`, `doctor`, `preview`, `latency` and `schema` below it.
+"""The command line: `scan`, and `process`, `compare`, `plan`, `study`, `doctor`, `preview`, `latency`, `schema` below.
 
 Exit codes: 0 done; 2 bad configuration or usage; 3 hardware; 4 the scan ran but its result fails its own quality gates;
 130 interrupted. Everything heavy is imported where it is used, so that `scan --help` answers at once.
@@ -24,10 +24,18 @@ from scanner.command_line import (
 
 if TYPE_CHECKING:
     from scanner.config import GatesSection, LoadedConfig, ScanSection
+    from scanner.patterns import Axis
     from scanner.result import ScanResult
     from scanner.terminal import Terminal
 
 app = new_app()
+
+study_app = typer.Typer(
+    help="Studies on ideal signals: what a rule can do.",
+    no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.add_typer(study_app, name="study")
 
 NOT_READY = 3
 GATES_FAILED = 4
@@ -164,6 +172,94 @@ def compare(
 
 @app.command()
 @interruptible
+def plan(
+    frames: Annotated[int, typer.Option("--frames", help="Frames of one round, all axes together, at most.")] = 108,
+    from_px: Annotated[
+        float, typer.Option("--from-px", help="Least distance between the two paths of a pixel, projector px.")
+    ] = 16,
+    to_px: Annotated[float, typer.Option("--to-px", help="Largest such distance, projector px.")] = 600,
+    width_px: Annotated[int, typer.Option("--width-px", help="Projector width, px.")] = 1280,
+    height_px: Annotated[int, typer.Option("--height-px", help="Projector height, px.")] = 800,
+    noise_dn: Annotated[float, typer.Option("--noise-dn", help="Standard deviation of a frame's noise, DN.")] = 1.5,
+    modulation_dn: Annotated[float, typer.Option("--modulation-dn", help="Fringe modulation B, DN.")] = 80,
+    false_alarm_rate: Annotated[float, typer.Option("--false-alarm-rate", help="Of the detection, 0..1.")] = 0.01,
+    alpha: Annotated[float, typer.Option("--alpha", help="Bounce over direct light, for the table's power.")] = 0.05,
+    axes: Annotated[str, typer.Option("--axes", help="x, y or x,y.")] = "x,y",
+    min_steps: Annotated[int, typer.Option("--min-steps", help="Fewest phase steps; from 4 on, faults show.")] = 4,
+    max_steps: Annotated[int, typer.Option("--max-steps", help="Most phase steps.")] = 12,
+    shortest_px: Annotated[float, typer.Option("--shortest-px", help="Shortest period, projector px.")] = 12,
+    longest_px: Annotated[float, typer.Option("--longest-px", help="Longest period, projector px.")] = 20,
+    blur_px: Annotated[float, typer.Option("--blur-px", help="Projector and camera blur, projector px.")] = 1.0,
+    free: Annotated[
+        bool,
+        typer.Option(
+            "--free", help="Any frequencies: sees more, but two paths cannot be separated, so not for method mfs."
+        ),
+    ] = False,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the table and its figure.")] = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Choose frequencies and phase steps for a frame budget, and show what frames buy."""
+    from rich.console import Console
+
+    from scanner.design import Demand
+    from scanner.folder import ComparisonFolder
+    from scanner.studies.reports import design_study, plan_rows
+    from scanner.terminal import plan_table
+
+    demand = Demand(
+        size=(width_px, height_px),
+        frames=frames,
+        from_px=from_px,
+        to_px=to_px,
+        relative_noise=noise_dn / modulation_dn,
+        false_alarm_rate=false_alarm_rate,
+        axes=_axes(axes),
+        steps=(min_steps, max_steps),
+        shortest_px=shortest_px,
+        longest_px=longest_px,
+        blur_px=blur_px,
+        separable=not free,
+    )
+    if out is None:
+        chosen, usual, plans = design_study(demand, None)
+    else:
+        with ComparisonFolder(out, overwrite=overwrite) as folder:
+            chosen, usual, plans = design_study(demand, folder.path)
+            folder.write_json(
+                "plan.json",
+                {"chosen": plan_rows([chosen])[0], "paper": plan_rows([usual])[0], "trade": plan_rows(plans)},
+            )
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(plan_table(chosen, usual, plans, alpha))
+    console.print("\nscan:\n" + chosen.yaml(), markup=False)
+
+
+@study_app.command("detection")
+@interruptible
+def study_detection(
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder; default: study-<time>.")] = None,
+    seeds: Annotated[int, typer.Option("--seeds", help="Independent pictures of every figure.", min=1)] = 8,
+    axes: Annotated[str, typer.Option("--axes", help="x, as the paper's simulation, or x,y.")] = "x",
+    fast: Annotated[bool, typer.Option("--small", help="Small pictures: minutes become seconds.")] = False,
+    overwrite: OverwriteOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Detection at the limit: the paper's α × σ study with three detectors, over all Δu, with intervals."""
+    from scanner.folder import ComparisonFolder
+    from scanner.studies.reports import detection_study
+    from scanner.terminal import Terminal
+
+    terminal = Terminal(quiet)
+    with ComparisonFolder(out or _default_out("study"), overwrite=overwrite) as folder:
+        with terminal.working() as report:
+            document = detection_study(folder.path, seeds, _axes(axes), fast, report)
+        folder.write_json("detection.json", document)
+    terminal.detection_study(document, folder.out)
+
+
+@app.command()
+@interruptible
 def doctor(
     config: Annotated[
         Path | None, typer.Option("--config", "-c", help="Bench file (YAML): say whether a scan with it could start.")
@@ -284,6 +380,14 @@ def _sections(
         ScanSection.model_validate_json(json.dumps(scan_document)),
         GatesSection.model_validate_json(json.dumps(recorded.get("gates") or {})),
     )
+
+
+def _axes(text: str) -> tuple[Axis, ...]:
+    """``x,y`` as axes, each once."""
+    names: list[Axis] = [a for a in ("x", "y") if a in [part.strip() for part in text.split(",")]]
+    if not names or len(names) != len(text.split(",")):
+        raise typer.BadParameter(f"--axes {text}: write x, y or x,y")
+    return tuple(names)
 
 
 def _default_out(stem: str) -> Path:

@@ -1,10 +1,11 @@
 """Where do bounces arrive? Detection with thresholds that follow the noise (method.md §4).
 
-Two statistics are offered. *variation* is the paper's: the standard deviation of the modulation over the frequencies.
+Three detectors are offered. *variation* is the paper's: the standard deviation of the modulation over the frequencies.
 *misfit* is χ² of the one-path fit to the complex phasors; it uses the phase too and sees several times weaker bounces.
-Both are compared with their distribution under noise alone, so that the operator chooses a false-alarm rate and never
-a grey level. Depth edges, which mix two surfaces in one pixel, look the same to either and are told apart by the
-surfaces beside them.
+*pooled* asks the neighbours as well (`scanner.pooling`) and joins the evidence of single pixels (`scanner.labelling`);
+it sees bounces far below the noise of a pixel. All are compared with their distribution under noise alone, so that the
+operator chooses a false-alarm rate and never a grey level. Depth edges, which mix two surfaces in one pixel, look the
+same to each and are told apart by the surfaces beside them.
 """
 
 from __future__ import annotations
@@ -17,11 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 
+from scanner.labelling import BOUNDARY_PRICE, label
 from scanner.phasors import AxisPhasors
+from scanner.pooling import Residuals, Spectra, pool
 from scanner.unwrapping import Coordinates
 
 _SMALLEST_REGION = 12
 """Fewer connected pixels than this are no region: nothing that a second round could light."""
+
+MOST_EVIDENCE = 3 * BOUNDARY_PRICE
+"""A single pixel never says more than its own boundary costs: no region stands on one pixel."""
 
 _EDGE_REACH = 3
 """How far from a depth edge, px, the optics mix both surfaces."""
@@ -125,6 +131,60 @@ def detect(
     for _ in range(2):
         found = (strong & (_count_neighbours(found) >= 1)) | found
         found |= suspect & (_count_neighbours(found) >= 5)
+    return _sorted_out(found, statistic, dof, coordinates, usable, threshold, excess)
+
+
+def detect_pooled(
+    residuals: Sequence[Residuals],
+    statistic: NDArray[np.float32],
+    dof: int,
+    coordinates: Sequence[Coordinates],
+    usable: NDArray[np.bool_],
+    false_alarm_rate: float,
+) -> Detection:
+    """Separate clean pixels, bounces and depth edges by evidence that is pooled over neighbours.
+
+    Parameters
+    ----------
+    residuals
+        Of each axis, from `scanner.pooling.one_path_residuals`.
+    statistic, dof, coordinates, usable, false_alarm_rate
+        As for `detect`; the statistic is χ² of the one-path fits.
+
+    Notes
+    -----
+    The region minimises evidence against boundary length (`scanner.labelling`): it is found where windows or single
+    pixels exceed the threshold, and what they raise by chance is too weak for the boundary it would need. Clean pixels
+    are therefore taken for a bounce less often than ``false_alarm_rate``.
+
+    The noise is measured twice: the lower quartile of all pixels lies too high where bounces cover some of them, that
+    of the pixels outside the region that was found with it does not.
+    """
+    spectra = Spectra.of(residuals, usable)
+    excess = max(1.0, excess_misfit(statistic, dof, usable))
+    found, start = np.zeros(usable.shape, bool), None
+    for _ in range(2):
+        pooled = pool(residuals, statistic, dof, usable, false_alarm_rate, excess, spectra)
+        evidence = np.clip(pooled.evidence, -MOST_EVIDENCE, MOST_EVIDENCE)
+        start = label(evidence, start=start)
+        found = usable & (start > 0.5)
+        before, excess = excess, max(1.0, excess_misfit(statistic, dof, usable & ~found))
+        if excess > 0.99 * before:
+            break
+    threshold = float(chi2_distribution.isf(false_alarm_rate, dof)) * excess
+    return _sorted_out(found, statistic, dof, coordinates, usable, threshold, excess)
+
+
+def _sorted_out(
+    found: NDArray[np.bool_],
+    statistic: NDArray[np.float32],
+    dof: int,
+    coordinates: Sequence[Coordinates],
+    usable: NDArray[np.bool_],
+    threshold: float,
+    excess: float,
+) -> Detection:
+    """Take depth edges, pinholes and specks out of the pixels found."""
     edge = _depth_edges(found, usable, coordinates)
     region = _without_small(_fill_pinholes(found & ~edge, usable), _SMALLEST_REGION)
     certain = float(chi2_distribution.isf(1e-6, dof)) * excess

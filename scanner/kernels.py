@@ -34,8 +34,14 @@ def over_pixels(kernel: Callable[[int, int], object], count: int) -> None:
     list(_POOL.map(lambda start: kernel(start, min(start + block, count)), range(0, count, block)))
 
 
+def over_rows(kernel: Callable[[int, int], object], count: int) -> None:
+    """Call ``kernel(start, stop)`` for bands that cover ``range(count)``, on all cores; raises what a band raised."""
+    band = max(1, -(-count // (2 * _CORES)))
+    list(_POOL.map(lambda start: kernel(start, min(start + band, count)), range(0, count, band)))
+
+
 @njit(inline="always")
-def _sin_cos_turns(turns):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+def sin_cos_turns(turns):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """sin(2πx) and cos(2πx) for |x| below some thousand turns, to 2e-7; polynomials, so that loops vectorise."""
     x = turns - np.float32(np.floor(turns + np.float32(0.5)))  # -1/2 .. 1/2
     # Fold to a quarter turn: sin(2πx) = sin(2π(±1/2 - x)), and the cosine changes sign.
@@ -137,7 +143,7 @@ def _unwrap(z, reference, frequency, gain, sigma_z, table, low, high, u, sigma_u
         for t in range(count):
             here, re, im, f = z[t, first : first + m], yr[t], yi[t], frequency[t]
             for j in range(m):
-                s, c = _sin_cos_turns(f * u0[j])
+                s, c = sin_cos_turns(f * u0[j])
                 zr, zi = here[j].real, here[j].imag
                 re[j] = zr * c + zi * s
                 im[j] = zi * c - zr * s
@@ -405,7 +411,7 @@ def unwrap_twin(
 def compile_all() -> float:
     """Compile every kernel of the package, for 8- and 16-bit frames, into the cache; returns the seconds it took."""
     began = time.perf_counter()
-    from scanner import cloud, paths, triangulation
+    from scanner import cloud, paths, pooling, triangulation
 
     few = np.ones((9, 4), np.complex64)
     paths.separate_two_paths(few, np.array([(80 + t) / 1280 for t in range(9)]), np.ones(4, np.float32), 1280)
@@ -417,6 +423,7 @@ def compile_all() -> float:
         frames = np.zeros((4, 8), dtype)
         demodulate(frames, steps, 255, z[0], np.zeros(8, np.float32), np.zeros(8, np.float32), np.zeros(8, bool))
     unwrap(z, np.array([1 / 16, 1 / 17, 1 / 18]), np.ones(3), np.ones(8, np.float32), -0.5, 63.5)
+    pooling.compile_all()
     return time.perf_counter() - began
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, SpinnerColumn, TaskID, TextColumn, TimeRemainingColumn
@@ -18,7 +19,39 @@ from scanner.comparison import Row
 from scanner.quality import passed
 from scanner.result import ScanResult
 
+if TYPE_CHECKING:
+    from scanner.design import DesignedPlan
+
 _PLAIN_EVERY_S = 2.0
+
+
+def plan_table(chosen: DesignedPlan, usual: DesignedPlan, plans: Sequence[DesignedPlan], alpha: float) -> Table:
+    """Show what frames buy: designed plans of several budgets, and the paper's."""
+    title = (
+        f"what frames buy: bounds of one pixel; power: bounces of α = {alpha:g} that χ² finds, mean and worst over Δu"
+    )
+    table = Table(title=title, title_justify="left", pad_edge=False)
+    for name in ("plan", "frames", "f", "steps", "σ_u, px", "wrong order", "power", "worst", "α₅₀", "worst α₅₀"):
+        table.add_column(name, justify="left" if name == "plan" else "right", no_wrap=True)
+    for name, plan in (("paper", usual), *(("designed", p) for p in plans)):
+        mean, worst = plan.power(alpha)
+        table.add_row(
+            "chosen" if plan.frame_count == chosen.frame_count and name == "designed" else name,
+            str(plan.frame_count),
+            "+".join(str(len(f)) for f in plan.frequencies.values()),
+            str(plan.steps),
+            f"{plan.sigma_px:.4f}",
+            f"{plan.wrong_orders:.0e}" if plan.wrong_orders > 1e-9 else "<1e-9",
+            f"{mean:.3f}",
+            f"{worst:.3f}",
+            f"{plan.typical_bounce:.3f}",
+            f"{plan.worst_bounce:.3f}",
+        )
+    table.caption = (
+        "f: frequencies by axis; α₅₀: the bounce that is found every other time, by its part of the direct light"
+    )
+    table.caption_justify = "left"
+    return table
 
 
 class Terminal:
@@ -167,6 +200,28 @@ class Terminal:
         self.console.print()
         self.console.print(table)
         self.console.print(f"pictures and figures: {path}", markup=False)
+
+    def detection_study(self, document: Mapping[str, Any], path: Path) -> None:
+        """Print the tables of a detection study."""
+        table = Table(title="detection at the limit, means over the seeds", title_justify="left", pad_edge=False)
+        names = ("α", "σ, DN", "detector", "IoU (95 %)", "false alarms", "border, 95 % within", "AUC", "best IoU")
+        for name in names:
+            table.add_column(name, justify="left" if name == "detector" else "right")
+        for row in document["pairs"]:
+            iou = row["iou"]
+            table.add_row(
+                f"{row['alpha']:g}",
+                f"{row['sigma_dn']:g}",
+                row["detector"],
+                f"{iou['mean']:.3f} ({iou['low']:.3f}..{iou['high']:.3f})",
+                f"{100 * row['false_alarms']['mean']:.2f} %",
+                f"{row['border_95_px']['mean']:.1f} px",
+                f"{row['auc']['mean']:.3f}",
+                f"{row['best_iou']['mean']:.3f}",
+            )
+        self.console.print()
+        self.console.print(table)
+        self.console.print(f"tables and figures: {path}", markup=False)
 
     def _close(self) -> None:
         if self._bar is not None:

@@ -186,10 +186,11 @@ class ScanSection(_Section):
     false_alarm_rate: float = Field(
         0.001, gt=0, lt=0.5, description="Share of clean pixels that may be taken for a bounce (0..0.5)."
     )
-    detector: Literal["misfit", "variation"] = Field(
+    detector: Literal["misfit", "variation", "pooled"] = Field(
         "misfit",
-        description="How bounces are detected. misfit: χ² of the one-path fit; variation: the paper's standard "
-        "deviation of the modulation over the frequencies, which sees less.",
+        description="How bounces are detected. misfit: χ² of the one-path fit; pooled: the same, pooled over "
+        "neighbours, which sees bounces below the noise of a pixel; variation: the paper's standard deviation of the "
+        "modulation over the frequencies, which sees less.",
     )
     regional_rule: Literal["sound", "literal"] = Field(
         "sound",

@@ -21,6 +21,7 @@ from scanner.config import ScanSection
 from scanner.interreflection import (
     Detection,
     detect,
+    detect_pooled,
     misfit_statistic,
     modulation_variation,
     variation_statistic,
@@ -38,6 +39,7 @@ from scanner.methods.multi_frequency import DecodedAxis, decode_axes, one_path_m
 from scanner.paths import choose_direct, separate_two_paths
 from scanner.patterns import Axis, Plan
 from scanner.phasors import RoundPhasors
+from scanner.pooling import one_path_residuals
 from scanner.regions import continued, inside, lit_together, literal_mask, pitch, sound_mask
 from scanner.result import Flag, Maps
 from scanner.rig import Rig
@@ -130,7 +132,10 @@ class MicroFrequencyShifting:
             statistic, dof = variation_statistic(variations, [d.sigma_z for d in decoded.values()], counts)
         else:
             statistic, dof = misfit_statistic(coordinates)
-        detection = detect(statistic, dof, coordinates, usable, setup.scan.false_alarm_rate)
+        if setup.scan.detector == "pooled":
+            detection = _detect_pooled(frames, decoded, usable, setup)
+        else:
+            detection = detect(statistic, dof, coordinates, usable, setup.scan.false_alarm_rate)
         separated = _separate(frames, decoded, detection, setup)
         flags = first_flags(usable, frames.saturated, [u for u in (maps.x_p, maps.y_p) if u is not None])
         flags[detection.region] |= np.uint16(Flag.INTERREFLECTION)
@@ -253,13 +258,25 @@ class MicroFrequencyShifting:
         return refuse_off_epipolar(fused, setup.rig)
 
 
+def _detect_pooled(
+    frames: RoundPhasors, decoded: dict[Axis, DecodedAxis], usable: NDArray[np.bool_], setup: Setup
+) -> Detection:
+    """Pool the residuals of all axes and detect."""
+    coordinates = [d.coordinates for d in decoded.values()]
+    statistic, dof = misfit_statistic(coordinates)
+    residuals = [
+        one_path_residuals(_phasors(frames, a), d.coordinates, d.sigma_z, d.gain, usable) for a, d in decoded.items()
+    ]
+    return detect_pooled(residuals, statistic, dof, coordinates, usable, setup.scan.false_alarm_rate)
+
+
 def _separate(frames: RoundPhasors, decoded: dict[Axis, DecodedAxis], detection: Detection, setup: Setup) -> Separated:
     """Two paths of every region pixel on every axis, and which of them is direct."""
     pixels = np.flatnonzero(detection.region)
     none = np.zeros(pixels.size, bool)
     empty = Separated(detection.region.shape, pixels, {}, {}, {}, none, none)
     axes: Sequence[Axis] = tuple(decoded)
-    if not pixels.size or any(not _equidistant(_phasors(frames, a).frequency) for a in axes):
+    if not pixels.size or any(not _separable(_phasors(frames, a).frequency, frames.plan.extent(a)) for a in axes):
         nan = np.full(pixels.size, np.nan, np.float32)
         return replace(
             empty, u=dict.fromkeys(axes, nan), sigma=dict.fromkeys(axes, nan), bounce=dict.fromkeys(axes, nan)
@@ -330,9 +347,10 @@ def _phasors(frames: RoundPhasors, axis: Axis):  # type: ignore[no-untyped-def]
     return phasors
 
 
-def _equidistant(frequency: NDArray[np.float64]) -> bool:
-    gaps = np.diff(frequency)
-    return frequency.size >= 5 and bool(np.allclose(gaps, gaps[0], rtol=1e-6))
+def _separable(frequency: NDArray[np.float64], extent: int) -> bool:
+    """Whether two paths can be separated with these frequencies: what `separate_two_paths` asks for."""
+    gaps = np.diff(np.sort(frequency))
+    return frequency.size >= 5 and bool(np.allclose(gaps, gaps[0], rtol=1e-6)) and gaps[0] * extent <= 1 + 1e-9
 
 
 def _put(plane: NDArray[np.float32], separated: Separated, values: NDArray[np.float32]) -> None:

@@ -145,7 +145,7 @@ MISTAKES = {
     "not a number at all": (BENCH + "scan:\n  mean: ▸.nan\n", "scan.mean", "expected a finite number", "a number"),
     "mistyped choice": (BENCH + "scan:\n  method: ▸mffs\n", "scan.method", "tps or mps or mps_gn or mfs", "`mfs`"),
     "a choice in capitals": (BENCH + "scan:\n  method: ▸MPS\n", "scan.method", "expected tps or mps", "`mps`"),
-    "an unlike choice": (BENCH + "scan:\n  detector: ▸magic\n", "scan.detector", "misfit or variation", "χ²"),
+    "an unlike choice": (BENCH + "scan:\n  detector: ▸magic\n", "scan.detector", "misfit or variation or pooled", "χ²"),
     "one axis without brackets": (BENCH + "scan:\n  axes: ▸x\n", "scan.axes", "expected a list", "write `axes: [x]`"),
     "an axis that is none": (BENCH + "scan:\n  axes: [x, ▸z]\n", "scan.axes[1]", "found z, expected x or y", "x or y"),
     "an axis twice": (BENCH + "scan:\n  axes: ▸[y, y]\n", "scan.axes", "expected each axis once", "[x, y]"),

@@ -80,7 +80,7 @@ def test_sine_and_cosine_polynomials():
     @njit
     def evaluate(x, s, c):
         for i in range(x.size):
-            s[i], c[i] = kernels._sin_cos_turns(x[i])
+            s[i], c[i] = kernels.sin_cos_turns(x[i])
 
     x = np.linspace(-3, 90, 200_001).astype(np.float32)
     s, c = np.empty_like(x), np.empty_like(x)
