@@ -27,7 +27,8 @@ virtual-bench: $(READY)  ## the same scan through the real drivers: window, GenI
 	$(BIN)/scan --config configs/virtual_bench.yaml --out virtual-bench-result --overwrite
 
 test: lint       ## lint, types, arrows and every test
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -m 'not bench and not alone' -n logical --maxprocesses 4 --dist loadfile
+	$(BIN)/python -m pytest -m 'alone and not bench'
 
 lint: $(READY)   ## style, types, and who may import whom
 	$(BIN)/ruff check .

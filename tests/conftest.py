@@ -22,6 +22,21 @@ def pytest_addoption(parser):
     )
 
 
+HERE = Path(__file__).parent
+ALONE = (
+    "calibration/test_guide", "calibration/test_person", "calibration/test_wizard", "conformance", "drivers",
+    "scanner/test_cli", "scanner/test_doctor", "scanner/test_preview", "scanner/test_take", "sim_backend/gentl",
+    "sim_backend/test_trigger_box", "sim_backend/test_world", "sim_backend/test_xserver", "test_virtual",
+)  # fmt: skip
+"""Where tests live on real time, windows or processes of their own: they have the machine to themselves."""
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if item.path.is_relative_to(HERE) and item.path.relative_to(HERE).as_posix().startswith(ALONE):
+            item.add_marker(pytest.mark.alone)
+
+
 def pytest_configure(config):
     # The suites look for their subjects while tests are collected.
     if config.getoption("--hardware"):
