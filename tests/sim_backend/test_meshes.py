@@ -62,9 +62,7 @@ def test_a_mesh_of_a_sphere_is_seen_and_lit_as_the_sphere(small):
     settings = small()
     transport = TransportSettings(photons=1000, supersample=2, specular_bounces=0, diffuse_bounces=0)
     matt = Material(0.6, 0.2, 0.3)
-    sphere, mesh = (
-        trace([s], settings.rig(), transport) for s in (Sphere(CENTRE, RADIUS, matt), _mesh_sphere(matt))
-    )
+    sphere, mesh = (trace([s], settings.rig(), transport) for s in (Sphere(CENTRE, RADIUS, matt), _mesh_sphere(matt)))
     both = np.isfinite(sphere.view.x_p) & np.isfinite(mesh.view.x_p)
     assert both.sum() > 0.98 * np.isfinite(sphere.view.x_p).sum()
     # The facets' sagitta is r (1 - cos(0.75°)) = 0.005 mm, along rays that meet them up to 80° from the normal.
