@@ -98,6 +98,7 @@ class MirrorRemovedScene(BoardBesideMirror):
 class SphereMirrorScene(BesideMirror):
     """A light grey matt ball with a plane mirror to its right, which throws a bounce on it."""
 
+    PARTS: ClassVar = ("ball", "mirror")
     MEASURED: ClassVar = ("ball",)
 
     name: Literal["sphere_mirror"] = "sphere_mirror"

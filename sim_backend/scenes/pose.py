@@ -6,7 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -21,13 +21,18 @@ Length = Annotated[float, Field(gt=0, le=10_000)]
 class Pose(BaseModel):
     """Where a scene is, how it is turned, and which of its parts are black."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
+        json_schema_extra=lambda schema, scene: _list_parts(schema, scene),
+    )
 
     seen_once: ClassVar[bool] = False
     """Whether it is not worth keeping on disk how its light goes, because it will not be seen like this again."""
 
-    PARTS: ClassVar[tuple[str, ...]]
-    """Names of what the scene consists of."""
+    PARTS: ClassVar[tuple[str, ...]] = ()
+    """Names of what the scene consists of, where its fields do not change them."""
 
     MEASURED: ClassVar[tuple[str, ...] | None] = None
     """Parts that are there to be measured; None for all."""
@@ -111,6 +116,12 @@ class Pose(BaseModel):
     ) -> Rectangle:
         """A rectangle given in the scene's frame."""
         return Rectangle(self.placed(centre), self.turned(half_width), self.turned(half_height), material)
+
+
+def _list_parts(schema: dict[str, Any], scene: type[Pose]) -> None:
+    """Say in a scene's JSON schema which parts can be blackened."""
+    if scene.PARTS:
+        schema["properties"]["blackened"]["items"]["enum"] = list(scene.PARTS)
 
 
 class Finish(BaseModel):

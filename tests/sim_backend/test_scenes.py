@@ -2,11 +2,14 @@
 
 import itertools
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
+from scanner.config import load_config
 from scanner.rig import Rig
 from sim_backend.bench import truth_of
 from sim_backend.scenes import Scene, scene_of
@@ -16,6 +19,7 @@ from sim_backend.surfaces import BLACK, Material, Rectangle
 from sim_backend.transport import trace
 from sim_backend.twins import twins_of, without_bounces
 
+CONFIGS = Path(__file__).parents[2] / "configs"
 NAMES = (
     *("v_board_sphere", "objects", "mirror_epipolar", "mirror_textured", "mirror_edge", "mirror_translucent"),
     *("polished", "mirror_chain", "fins", "mirror", "sphere_mirror", "v_groove"),
@@ -75,6 +79,27 @@ def test_only_what_there_is_can_be_blackened():
         scene_of({"name": "mirror", "blackened": ["miror"]})
     with pytest.raises(ValidationError, match="parts are ball"):
         scene_of({"name": "sphere_mirror", "with_mirror": False, "blackened": ["mirror"]})
+
+
+def test_the_demos_comment_names_every_scene():
+    text = (CONFIGS / "demo.yaml").read_text(encoding="utf-8")
+    listed = text[text.index("name: mirror") : text.index("blackened:")]
+    for name in TypeAdapter(Scene).json_schema()["discriminator"]["mapping"]:
+        assert re.search(rf"\b{name}\b", listed), name
+
+
+@pytest.mark.parametrize("file", sorted(CONFIGS.glob("[ps][ac]*/*.yaml")), ids=lambda f: f.stem)
+def test_bench_files_of_the_scenes_are_sound(file):
+    settings = load_config(file).bench_settings
+    assert settings.scene.surfaces()
+    assert settings.projector.lens().size == (1280, 800)
+    # The lines that are commented out are right as well.
+    text = file.read_text(encoding="utf-8")
+    if "#- width_px" in text:
+        changes = dict(re.findall(r"#- (\w+): (\d+)", text))
+        places = {"width_px": "camera", "height_px": "camera"}
+        load_config(file, {f"bench.{places.get(name, 'transport')}.{name}": int(n) for name, n in changes.items()})
+        assert changes == {"width_px": "4008", "height_px": "2688", "specular_bounces": "0", "diffuse_bounces": "0"}
 
 
 @pytest.mark.parametrize("name", NAMES)
