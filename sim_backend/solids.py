@@ -10,8 +10,8 @@ import numpy as np
 from sim_backend.meshes import Triangles
 from sim_backend.surfaces import Array
 
-_SIDES = 360
-"""Of a turned solid; its facets lie r·4e-5 below the round, less than a shadow ray's clearance for r < 260 mm."""
+_SIDES = 240
+"""Of a turned solid; its facets lie r·9e-5 below the round, less than a shadow ray's clearance for r < 110 mm."""
 
 
 def turned_solid(profile: Sequence[tuple[float, float]], sides: int = _SIDES) -> tuple[Array, Triangles]:

@@ -54,8 +54,15 @@ def test_a_hit_gives_the_very_same_matrices(settings, traced, scene):
     np.testing.assert_array_equal(first.bounced_light(light), second.bounced_light(light))
 
 
-def test_tracing_is_deterministic(settings, tmp_path):
-    _same(transport_of(settings("v_groove")), transport_of(settings("v_groove", cache_dir=tmp_path / "other")))
+@pytest.mark.parametrize("scene", ["v_groove", "fins", "mirror_textured", "mirror_translucent"])
+def test_tracing_is_deterministic(settings, tmp_path, scene):
+    _same(transport_of(settings(scene)), transport_of(settings(scene, cache_dir=tmp_path / "other")))
+
+
+def test_the_cache_keeps_all_of_it(settings):
+    traced, kept = transport_of(settings("mirror_translucent")), transport_of(settings("mirror_translucent"))
+    _same(traced, kept)
+    assert kept.spreads == traced.spreads != ()
 
 
 def _entry(folder):
