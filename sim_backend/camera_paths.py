@@ -34,7 +34,7 @@ class View(Columns):
         float32, the projector px that lights the point, NaN where no direct light comes from.
     mixed
         bool, the pixel's rays meet different surfaces, or light and shadow.
-    print
+    print_gain
         float32, how much brighter a printed surface is there than on the mean; 1 on others.
     """
 
@@ -43,7 +43,7 @@ class View(Columns):
     x_p: Floats
     y_p: Floats
     mixed: NDArray[np.bool_]
-    print: Floats
+    print_gain: Floats
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,7 +76,7 @@ class Bounce:
         height, width = light.shape
         size = cells.shape[1] * self.cell_px, cells.shape[0] * self.cell_px
         fine = cv2.resize(cells, size, interpolation=cv2.INTER_LINEAR)[:height, :width]
-        np.add(light, fine * view.print, out=light, where=view.surface == self.surface)
+        np.add(light, fine * view.print_gain, out=light, where=view.surface == self.surface)
 
 
 @dataclass(frozen=True)

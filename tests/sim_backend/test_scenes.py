@@ -12,10 +12,13 @@ from pydantic import TypeAdapter, ValidationError
 from scanner.config import load_config
 from scanner.rig import Rig
 from sim_backend.bench import truth_of
+from sim_backend.meshes import MeshSurface
+from sim_backend.projector_paths import Photons, follow
+from sim_backend.raycasting import RayCaster
 from sim_backend.scenes import Scene, scene_of
 from sim_backend.settings import SimulatedSettings
 from sim_backend.solids import box
-from sim_backend.surfaces import BLACK, Material, Rectangle
+from sim_backend.surfaces import BLACK, Material, Rectangle, Sphere
 from sim_backend.transport import trace
 from sim_backend.twins import twins_of, without_bounces
 
@@ -215,6 +218,33 @@ def test_print_darkens_direct_and_bounced_light_alike(small):
     assert np.median(printed.direct_amplitude[region]) < 70
 
 
+def test_a_dark_print_throws_less_light():
+    """Photons that leave white and dark checks carry the reflectance of the very place."""
+    scene = scene_of({"name": "mirror_textured", "offset_x_mm": 0.0, "check_mm": 20.0})
+    board, _ = scene.surfaces()
+    count = 2000
+    rng = np.random.default_rng(4)
+    # The check at the left top is dark, the next one white.
+    for column, reflectance in ((0, 0.08), (1, 0.8)):
+        x, y = rng.uniform(1, 19, (2, count))
+        place = np.stack((x - 130 + 20 * column, y - 125, np.full(count, 600.0)), 1)
+        photons = Photons(
+            u=np.zeros(count),
+            v=np.zeros(count),
+            flux=np.full(count, 1 / count),
+            point=place,
+            normal=np.tile([0, 0, -1.0], (count, 1)),
+            direction=np.tile([0, 0, 1.0], (count, 1)),
+            surface=np.zeros(count, np.int16),
+            lobe_mm=np.zeros(count),
+            choice=rng.random((count, 2)),
+        )
+        around = Sphere(np.array([0, 0, 600.0]), 400.0, BLACK)  # catches all
+        caster = RayCaster([board, around])
+        (arrived,) = follow(caster, [board.material, BLACK], photons, rng, bounces=1, diffuse=True)
+        assert arrived.flux.sum() == pytest.approx(reflectance, rel=1e-6)
+
+
 def test_both_sides_of_a_depth_edge_get_the_mirrors_bounce(small):
     settings = small(scene={"name": "mirror_edge"})
     found = truth_of(settings)
@@ -398,10 +428,6 @@ def test_swapping_camera_and_projector_gives_the_same_light():
 @pytest.mark.parametrize("material", [Material(0.0, 0.9), Material(0.3, 0.4, 0.2)])
 def test_no_scene_gives_back_more_than_it_gets(material):
     """In a box that nothing leaves, each reflection keeps just the surfaces' share of the light."""
-    from sim_backend.meshes import MeshSurface
-    from sim_backend.projector_paths import Photons, follow
-    from sim_backend.raycasting import RayCaster
-
     walls = MeshSurface.of(*box(80, 60, 100), material)
     count = 20_000
     rng = np.random.default_rng(8)
