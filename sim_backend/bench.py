@@ -86,7 +86,7 @@ def truth_of(settings: SceneSettings, presented: Mapping[str, Any] | None = None
 
     if presented is not None:
         settings = settings.model_copy(update={"scene": scene_of(presented)})
-    return Truth(Optics.of(settings, _transports().of(settings)), settings.rig())
+    return Truth(Optics.of(settings, _transports().of(settings)), settings.rig(), settings.scene.windows())
 
 
 kind: BenchKind = SimulatedBenchKind()

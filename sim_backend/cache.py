@@ -25,17 +25,25 @@ _SOURCES = (
     "camera_paths",
     "columns",
     "kernels",
+    "mesh_files",
+    "meshes",
     "prints",
     "projector_paths",
     "raycasting",
     "reflection",
     "scenes/__init__",
     "scenes/artefacts",
+    "scenes/beside_mirror",
     "scenes/boards",
+    "scenes/glossy",
+    "scenes/industrial",
+    "scenes/matt_objects",
     "scenes/mirrors",
     "scenes/pose",
     "scenes/shapes",
+    "scenes/windows",
     "sheets",
+    "solids",
     "surfaces",
     "transport",
     "viewpoint",
@@ -110,10 +118,19 @@ def _content_hash(settings: SceneSettings) -> str:
     content = {
         "sources": [hashlib.sha256((here / f"{name}.py").read_bytes()).hexdigest() for name in _SOURCES],
         "scene": settings.scene.model_dump(mode="json"),
+        "files": [hashlib.sha256(_content(path)).hexdigest() for path in settings.scene.files()],
         "rig": settings.rig().to_json(),
         "transport": settings.transport.model_dump(mode="json"),
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _content(path: Path) -> bytes:
+    """What a file holds; nothing if it cannot be read, which the scene will say better."""
+    try:
+        return path.read_bytes()
+    except OSError:
+        return b""
 
 
 def _store(transport: Transport, path: Path, limit_bytes: int) -> None:

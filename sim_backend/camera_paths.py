@@ -34,6 +34,8 @@ class View(Columns):
         float32, the projector px that lights the point, NaN where no direct light comes from.
     mixed
         bool, the pixel's rays meet different surfaces, or light and shadow.
+    print_gain
+        float32, how much brighter a printed surface is there than on the mean; 1 on others.
     """
 
     surface: NDArray[np.int8]
@@ -41,6 +43,7 @@ class View(Columns):
     x_p: Floats
     y_p: Floats
     mixed: NDArray[np.bool_]
+    print_gain: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +152,8 @@ class _Tracer:
         dy, dx = (d.ravel() for d in np.meshgrid(offset, offset, indexing="ij"))
         direction = unit(self.camera.rays(np.stack((x[..., None] + dx, y[..., None] + dy), -1).reshape(-1, 2)))
         hits = self.caster.first_hits(self.camera.centre, direction)
-        sub_uv, sub_radiance = self.lit(hits, -direction, self.sides(x, y, hits) if self.caster.sheets else None)
+        sides = self.sides(x, y, hits) if self.caster.sheets else None
+        sub_uv, sub_radiance = self.lit(hits, -direction, sides)
 
         surfaces, lit = hits.surface.reshape(-1, rays), (sub_radiance > 0).reshape(-1, rays)
         mixed = (surfaces != centre.surface[:, None]).any(1) | (lit != (radiance > 0)[:, None]).any(1)
@@ -168,6 +172,7 @@ class _Tracer:
             x_p.astype(np.float32).reshape(shape),
             y_p.astype(np.float32).reshape(shape),
             mixed.reshape(shape),
+            self.brighter(centre, hits, sides).astype(np.float32).reshape(shape),
         )
         pixel = np.repeat(np.arange(first_row * width, end_row * width, dtype=np.int32), rays)
         return view, direct, *self.by_mirror(pixel, direction, hits)
@@ -185,6 +190,20 @@ class _Tracer:
             ends.append(self.caster.extended(surface, self.camera.centre, direction))
         sides = np.stack((ends[0] - ends[1], ends[2] - ends[3]), 1) / self.supersample
         return np.repeat(sides, self.supersample**2, axis=0)
+
+    def brighter(self, centre: Hits, hits: Hits, sides: Array | None) -> Array:
+        """(pixels,) how much brighter than on the mean is what the pixels' rays see of the print at their centres."""
+        factor = np.ones(len(centre.surface))
+        if sides is None:
+            return factor
+        rays = self.supersample**2
+        same = hits.surface.reshape(-1, rays) == centre.surface[:, None]
+        share = (self.caster.diffuse(hits, sides).reshape(-1, rays) * same).sum(1) / np.maximum(same.sum(1), 1)
+        for number in self.caster.sheets:
+            mean = self.caster.materials[number, 0]
+            at = np.flatnonzero((centre.surface == number) & same.any(1))
+            factor[at] = share[at] / mean if mean else 1.0
+        return factor
 
     def lit(self, hits: Hits, to_eye: Array, sides: Array | None = None) -> tuple[Array, Array]:
         """Projector px (n, 2) of hit points, and the radiance (n,) that direct light gives them towards the eye.

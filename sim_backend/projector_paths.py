@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backend.columns import Columns
-from sim_backend.raycasting import MISS, RayCaster
+from sim_backend.raycasting import MISS, Hits, RayCaster
 from sim_backend.reflection import scatter_diffuse, scatter_specular, unit
 from sim_backend.surfaces import Array, Material
 from sim_backend.viewpoint import Viewpoint
@@ -97,7 +97,7 @@ def follow(
     """
     wanted = np.zeros(len(photons.u), bool) if diffuse else np.ones(len(photons.u), bool)
     for _ in range(bounces):
-        direction, share, lobe_rad, matt = _scatter(materials, photons, random, diffuse)
+        direction, share, lobe_rad, matt = _scatter(caster, materials, photons, random, diffuse)
         on = np.flatnonzero(share > 0)
         if on.size == 0:
             return
@@ -121,7 +121,7 @@ def follow(
 
 
 def _scatter(
-    materials: Sequence[Material], photons: Photons, random: np.random.Generator, diffuse: bool
+    caster: RayCaster, materials: Sequence[Material], photons: Photons, random: np.random.Generator, diffuse: bool
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     """New directions, the shares of flux that go there, the lobes' breadth (rad), which reflections were diffuse."""
     n = len(photons.u)
@@ -142,5 +142,11 @@ def _scatter(
             share[glossy] *= total / material.specular
         matt |= here & ~glossy
         share[here & ~glossy] = total
+        if number in caster.sheets and material.diffuse:
+            # Where the print is dark, less is scattered than on the mean.
+            at = np.flatnonzero(here & ~glossy)
+            share[at] *= (
+                caster.diffuse(Hits(photons.surface[at], photons.point[at], photons.normal[at])) / material.diffuse
+            )
     direction[matt] = scatter_diffuse(photons.normal[matt], photons.choice[matt])
     return direction, share, lobe_rad, matt

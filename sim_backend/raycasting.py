@@ -15,6 +15,7 @@ load_libusb()  # before Open3D, which needs it
 import open3d as o3d  # noqa: E402
 
 from sim_backend.kernels import meet  # noqa: E402
+from sim_backend.meshes import MeshSurface  # noqa: E402
 from sim_backend.sheets import Sheet  # noqa: E402
 from sim_backend.surfaces import Array, Surface  # noqa: E402
 
@@ -60,6 +61,7 @@ class RayCaster:
         """(surfaces, 3) diffuse share, specular share, concentration of the lobe."""
         self.sheets = {number: surface for number, surface in enumerate(surfaces) if isinstance(surface, Sheet)}
         """The printed ones, by number."""
+        self._meshes = {number: surface for number, surface in enumerate(surfaces) if isinstance(surface, MeshSurface)}
 
     def first_hits(self, origin: Array, direction: Array, leaving: Array | None = None) -> Hits:
         """What rays meet first.
@@ -78,10 +80,18 @@ class RayCaster:
         # Open3D's number for "none" is the largest uint32, which becomes -1.
         surface = cast["geometry_ids"].numpy().astype(np.int16)
         begin = np.array(np.broadcast_to(origin, direction.shape), order="C")
-        return Hits(surface, *meet(self._shapes, surface, begin, direction))
+        point, normal = meet(self._shapes, surface, begin, direction)
+        for number, mesh in self._meshes.items():
+            at = np.flatnonzero(surface == number)
+            triangle = cast["primitive_ids"].numpy()[at].astype(np.int64)
+            point[at], normal[at] = mesh.meet(triangle, begin[at], direction[at])
+        return Hits(surface, point, normal)
 
     def extended(self, surface: NDArray[np.int16], origin: Array, direction: Array) -> Array:
-        """(n, 3) mm, where rays from ``origin`` (3,) meet surfaces (n,), or what goes on beyond their edges."""
+        """(n, 3) mm, where rays from ``origin`` (3,) meet surfaces (n,), or what goes on beyond their edges.
+
+        Of surfaces made of triangles, nothing goes on; what is returned for them means nothing.
+        """
         begin = np.array(np.broadcast_to(origin, direction.shape), order="C")
         return np.asarray(meet(self._shapes, surface, begin, direction)[0])
 

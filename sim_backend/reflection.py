@@ -13,6 +13,8 @@ import numpy as np
 
 from sim_backend.surfaces import Array, Material
 
+_TINY = 1e-12
+
 
 def dot(a: Array, b: Array) -> Array:
     """(n,) scalar products of vectors (n, 3)."""
@@ -50,8 +52,9 @@ def scatter_specular(material: Material, direction: Array, normal: Array, unifor
         return axis, np.full(len(axis), material.specular)
     cos = 1 + np.log1p(uniform[:, 0] * math.expm1(-2 * material.concentration)) / material.concentration
     out = _about(axis, cos, uniform[:, 1])
-    cos_in, cos_out = -dot(direction, normal), dot(out, normal)
-    return out, material.specular * np.clip(cos_out, 0, None) / np.maximum(cos_in, cos_out)
+    # Interpolated normals may turn from a ray that grazes its triangle: then nothing goes on below the surface.
+    cos_in, cos_out = -dot(direction, normal), np.maximum(dot(out, normal), 0)
+    return out, material.specular * cos_out / np.maximum(np.maximum(cos_in, cos_out), _TINY)
 
 
 def scatter_diffuse(normal: Array, uniform: Array) -> Array:

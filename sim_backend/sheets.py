@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -43,6 +44,15 @@ class Sheet:
     figures: Print
     light: float
     dark: float
+
+    @property
+    def lights_itself(self) -> bool:
+        """It is bent so little that it hardly does."""
+        return False
+
+    def blackened(self) -> Self:
+        """The same, but it absorbs all light."""
+        return replace(self, light=0.0, dark=0.0)
 
     @cached_property
     def _half_width(self) -> float:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +28,17 @@ class Material:
     roughness
         0 a perfect mirror, 1 a very broad lobe, on the perceptual scale of Burley (SIGGRAPH course 2012): the facets'
         slope parameter is its square.
+    subsurface
+        Part of ``diffuse``, 0..1, that leaves the surface elsewhere than it entered.
+    spread_mm
+        Standard deviation along each direction of how far from there, mm.
     """
 
     diffuse: float
     specular: float = 0.0
     roughness: float = 0.0
+    subsurface: float = 0.0
+    spread_mm: float = 0.0
 
     @property
     def lobe_rad(self) -> float:
@@ -45,8 +51,21 @@ class Material:
         return self.lobe_rad**-2 if self.roughness else math.inf
 
 
+BLACK = Material(0.0)
+"""Absorbs all light."""
+
+
 class Surface(Protocol):
     """A surface that rays meet; both its sides have the material."""
+
+    @property
+    def lights_itself(self) -> bool:
+        """Whether light that leaves it can meet it again."""
+        ...
+
+    def blackened(self) -> Self:
+        """The same, but it absorbs all light."""
+        ...
 
     @property
     def material(self) -> Material:
@@ -111,6 +130,15 @@ class Rectangle:
     half_height: Array
     material: Material
 
+    @property
+    def lights_itself(self) -> bool:
+        """A flat one does not."""
+        return False
+
+    def blackened(self) -> Self:
+        """The same, but it absorbs all light."""
+        return replace(self, material=BLACK)
+
     @cached_property
     def normal(self) -> Array:
         """(3,) unit normal."""
@@ -147,6 +175,15 @@ class Sphere:
     centre: Array
     radius: float
     material: Material
+
+    @property
+    def lights_itself(self) -> bool:
+        """A convex one does not."""
+        return False
+
+    def blackened(self) -> Self:
+        """The same, but it absorbs all light."""
+        return replace(self, material=BLACK)
 
     _RINGS = 200  # facets lie at most r·3e-5 below the sphere, less than the shadow rays' clearance
 

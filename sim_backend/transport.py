@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
@@ -76,7 +76,40 @@ class Bounce:
         height, width = light.shape
         size = cells.shape[1] * self.cell_px, cells.shape[0] * self.cell_px
         fine = cv2.resize(cells, size, interpolation=cv2.INTER_LINEAR)[:height, :width]
-        np.add(light, fine, out=light, where=view.surface == self.surface)
+        np.add(light, fine * view.print_gain, out=light, where=view.surface == self.surface)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How light wanders within the material of a surface before it leaves.
+
+    Parameters
+    ----------
+    surface
+        Number of the surface.
+    share
+        Part of its light that does.
+    sigma_px
+        Standard deviation of how far, along the rows and the columns of the camera's picture, px.
+    """
+
+    surface: int
+    share: float
+    sigma_px: tuple[float, float]
+
+    def of(self, light: Floats, view: View) -> Floats:
+        """The ``light`` (height, width) after it has wandered; none leaves the surface's edges."""
+        there = view.surface == self.surface
+
+        def blurred(picture: Floats) -> Floats:
+            x, y = self.sigma_px
+            size = (0, 0)  # as wide as the standard deviations need
+            return np.asarray(
+                cv2.GaussianBlur(picture, size, sigmaX=x, sigmaY=y, borderType=cv2.BORDER_CONSTANT), np.float32
+            )
+
+        spread = blurred(np.where(there, light, np.float32(0))) / np.maximum(blurred(there.astype(np.float32)), 1e-6)
+        return np.where(there, light + np.float32(self.share) * (spread - light), light)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +128,8 @@ class Transport:
         Light that a surface gets from others.
     seen_in_mirror
         (camera pixels, camera pixels) how that light is seen in mirrors.
+    spreads
+        Surfaces within whose material light wanders.
     """
 
     projector_size: tuple[int, int]
@@ -103,10 +138,11 @@ class Transport:
     by_mirror: SparseRows
     bounces: tuple[Bounce, ...]
     seen_in_mirror: SparseRows
+    spreads: tuple[Spread, ...] = ()
 
     def direct_light(self, light_out: Floats) -> Floats:
         """(height, width) radiance of direct light for what the projector sends out, (height, width) in 0..1."""
-        return (self.direct @ light_out.ravel()).reshape(self.view.surface.shape)
+        return self._spread((self.direct @ light_out.ravel()).reshape(self.view.surface.shape))
 
     def bounced_light(self, light_out: Floats, *, diffuse: bool = True) -> Floats:
         """(height, width) radiance of light that took more than one reflection; without diffuse ones if so asked."""
@@ -114,13 +150,22 @@ class Transport:
         for bounce in self.bounces:
             if diffuse or not bounce.diffuse:
                 bounce.add_to(light, light_out, self.view)
+        light = self._spread(light)
         if self.seen_in_mirror.value.size:
             light += (self.seen_in_mirror @ light.ravel()).reshape(light.shape)
         return light
 
+    def _spread(self, light: Floats) -> Floats:
+        for spread in self.spreads:
+            light = spread.of(light, self.view)
+        return light
+
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """The same as named arrays, for a file."""
-        arrays = {"projector_size": np.array(self.projector_size)}
+        arrays = {
+            "projector_size": np.array(self.projector_size),
+            "spreads": np.array([(s.surface, s.share, *s.sigma_px) for s in self.spreads]).reshape(-1, 4),
+        }
         arrays |= {f"view.{f.name}": getattr(self.view, f.name) for f in fields(View)}
         for name in ("direct", "by_mirror", "seen_in_mirror"):
             arrays |= _matrix_arrays(name, getattr(self, name))
@@ -146,6 +191,7 @@ class Transport:
             _matrix("by_mirror", arrays),
             tuple(bounces),
             _matrix("seen_in_mirror", arrays),
+            tuple(Spread(int(s[0]), float(s[1]), (float(s[2]), float(s[3]))) for s in arrays["spreads"]),
         )
 
 
@@ -153,8 +199,8 @@ def trace(surfaces: Sequence[Surface], rig: Rig, settings: TransportSettings) ->
     """Trace all light of a scene; deterministic."""
     caster, camera, projector = RayCaster(surfaces), Viewpoint.camera(rig), Viewpoint.projector(rig)
     seen = trace_camera(caster, camera, projector, settings.supersample, settings.specular_bounces)
-    # A lone surface throws no light on itself: each is flat or convex, or a sheet bent so little that it hardly does.
-    bounced = _bounced(surfaces, _Bounces(caster, camera, projector, seen.view), settings) if len(surfaces) > 1 else []
+    alone = len(surfaces) == 1 and not surfaces[0].lights_itself
+    bounced = [] if alone else _bounced(surfaces, _Bounces(caster, camera, projector, seen.view), settings)
     return Transport(
         rig.projector.size,
         seen.view,
@@ -162,7 +208,23 @@ def trace(surfaces: Sequence[Surface], rig: Rig, settings: TransportSettings) ->
         _over_pixels(seen.by_mirror, seen.view.surface.size, rig.projector.size),
         tuple(bounced),
         seen.seen_in_mirror,
+        tuple(_spreads(surfaces, rig, seen.view)),
     )
+
+
+def _spreads(surfaces: Sequence[Surface], rig: Rig, view: View) -> Iterator[Spread]:
+    """How far light wanders within the surfaces, in the camera's picture."""
+    for number, material in enumerate(surface.material for surface in surfaces):
+        if not (material.subsurface and material.spread_mm and (view.surface == number).any()):
+            continue
+        point = np.where((view.surface == number)[..., None], rig.camera.pixel_rays() * view.depth[..., None], np.nan)
+        # mm from pixel to pixel along the rows and the columns, in the median, since the blur is one for all.
+        steps = [np.linalg.norm(np.diff(point, axis=axis), axis=-1) for axis in (1, 0)]
+        x, y = (
+            material.spread_mm / float(np.median(s[np.isfinite(s)])) if np.isfinite(s).any() else 0.0 for s in steps
+        )
+        if x and y:
+            yield Spread(number, material.subsurface, (x, y))
 
 
 def _bounced(surfaces: Sequence[Surface], bounces: _Bounces, settings: TransportSettings) -> list[Bounce]:

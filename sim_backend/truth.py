@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import cv2
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from scanner.rig import Rig
 from sim_backend.kernels import Floats
 from sim_backend.optics import Optics, Sensor
+from sim_backend.scenes import Window
 
 _PERIOD_PX = 16
 _LEAST_BOUNCE = 1e-6
@@ -29,10 +31,13 @@ class Truth:
         The chain from projector to camera.
     rig
         Where camera and projector truly are.
+    windows
+        The scene's windows, by name.
     """
 
     optics: Optics
     rig: Rig
+    windows: Mapping[str, Window] = field(default_factory=dict)
 
     @property
     def x_p(self) -> Floats:
@@ -59,11 +64,16 @@ class Truth:
         """(height, width, 3) mm in the camera frame of what the pixel's centre sees."""
         return np.asarray(self.rig.camera.pixel_rays() * self.depth[..., None], np.float64)
 
+    def in_window(self, name: str) -> NDArray[np.bool_]:
+        """Pixels that see the scene's window of this name; ``KeyError`` for one that it does not have."""
+        return self.windows[name].holds(self.points, self.object_id)
+
     @cached_property
     def edge(self) -> NDArray[np.bool_]:
-        """Pixels that mix surfaces, or light and shadow, within themselves or through the camera's blur."""
+        """Pixels that mix surfaces, depths, or light and shadow, within themselves or through the camera's blur."""
         view = self.optics.transport.view
         mixed = view.mixed | _changes(view.surface) | _changes(np.isfinite(view.x_p))
+        mixed |= _jumps(view.depth, float(self.rig.camera.matrix[0, 0]))
         reach = math.ceil(3 * self.optics.camera.blur_px)
         return np.asarray(cv2.dilate(mixed.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)), bool)
 
@@ -122,6 +132,18 @@ class Truth:
     def bounce_y(self) -> Floats:
         """Mean projector row, px, as `bounce_x`."""
         return self._bounce[1]
+
+
+def _jumps(depth: Floats, focal_px: float) -> NDArray[np.bool_]:
+    """Pixels beside which the depth jumps by more than two pixels are wide there.
+
+    On planes the inverse of the depth is linear in the picture, so that its second difference vanishes.
+    """
+    near = 1 / depth.astype(np.float64)
+    jumps = np.zeros(depth.shape, bool)
+    for along, flags in ((near, jumps), (near.T, jumps.T)):
+        flags[1:-1] |= np.abs(along[2:] - 2 * along[1:-1] + along[:-2]) > 2 / focal_px * along[1:-1]
+    return jumps
 
 
 def _changes(labels: NDArray[np.int8] | NDArray[np.bool_]) -> NDArray[np.bool_]:

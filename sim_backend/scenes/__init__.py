@@ -11,24 +11,48 @@ from typing import Annotated, Any
 from pydantic import Field, TypeAdapter
 
 from sim_backend.scenes.artefacts import BallBarScene
+from sim_backend.scenes.beside_mirror import (
+    EdgeMirrorScene,
+    EpipolarMirrorScene,
+    MirrorChainScene,
+    PolishedScene,
+    TexturedMirrorScene,
+    TranslucentMirrorScene,
+)
 from sim_backend.scenes.boards import BoardScene
+from sim_backend.scenes.glossy import FinsScene, VBoardSphereScene
+from sim_backend.scenes.industrial import PartScene, Piece
+from sim_backend.scenes.matt_objects import ObjectsScene
 from sim_backend.scenes.mirrors import MirrorRemovedScene, MirrorScene, SphereMirrorScene
 from sim_backend.scenes.pose import Finish, Pose
 from sim_backend.scenes.shapes import PlaneScene, SphereScene, StepsScene, VGrooveScene
+from sim_backend.scenes.windows import Window
 
 __all__ = [
     "BallBarScene",
     "BoardScene",
+    "EdgeMirrorScene",
+    "EpipolarMirrorScene",
     "Finish",
+    "FinsScene",
+    "MirrorChainScene",
     "MirrorRemovedScene",
     "MirrorScene",
+    "ObjectsScene",
+    "PartScene",
+    "Piece",
     "PlaneScene",
+    "PolishedScene",
     "Pose",
     "Scene",
     "SphereMirrorScene",
     "SphereScene",
     "StepsScene",
+    "TexturedMirrorScene",
+    "TranslucentMirrorScene",
+    "VBoardSphereScene",
     "VGrooveScene",
+    "Window",
     "scene_of",
 ]
 
@@ -41,7 +65,17 @@ Scene = Annotated[
     | MirrorRemovedScene
     | SphereMirrorScene
     | BallBarScene
-    | BoardScene,
+    | BoardScene
+    | VBoardSphereScene
+    | ObjectsScene
+    | EpipolarMirrorScene
+    | TexturedMirrorScene
+    | EdgeMirrorScene
+    | TranslucentMirrorScene
+    | PolishedScene
+    | MirrorChainScene
+    | FinsScene
+    | PartScene,
     Field(discriminator="name"),
 ]
 """Any of the scenes, told apart by ``name``."""

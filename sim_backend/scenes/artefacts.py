@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -12,6 +13,8 @@ from sim_backend.surfaces import Array, Sphere, Surface
 
 class BallBarScene(Pose):
     """Two balls of one size at a known distance along the scene's x; the pose's origin is midway between them."""
+
+    PARTS: ClassVar = ("left", "right")
 
     name: Literal["ball_bar"] = "ball_bar"
     radius_mm: Length = Field(25.0, description="Radius of either ball, mm.")
@@ -29,6 +32,7 @@ class BallBarScene(Pose):
     def _centres(self) -> list[Array]:
         return [self.placed((side * self.spacing_mm / 2, 0, 0)) for side in (-1, 1)]
 
-    def surfaces(self) -> list[Surface]:
-        """What there is, in the camera frame: the left ball, the right ball."""
-        return [Sphere(centre, self.radius_mm, self.finish.material) for centre in self._centres()]
+    def parts(self) -> Mapping[str, Sequence[Surface]]:
+        """What there is by name, in the camera frame."""
+        balls = [Sphere(centre, self.radius_mm, self.finish.material) for centre in self._centres()]
+        return {name: [ball] for name, ball in zip(self.PARTS, balls, strict=True)}

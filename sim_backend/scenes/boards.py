@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -23,6 +24,7 @@ class BoardScene(Pose):
     """
 
     seen_once: ClassVar[bool] = True
+    PARTS: ClassVar = ("board",)
 
     name: Literal["board"] = "board"
     width_mm: Length = Field(280.0, description="Width of the sheet, mm.")
@@ -53,21 +55,20 @@ class BoardScene(Pose):
             raise ValueError(f"bend_mm must stay within {_MOST_BEND:g} of width_mm: a board is nearly flat")
         return self
 
-    def surfaces(self) -> list[Surface]:
-        """What there is, in the camera frame: the sheet."""
+    def parts(self) -> Mapping[str, Sequence[Surface]]:
+        """What there is by name, in the camera frame."""
         # Imported here, because finding one's way on a print needs Numba, and the settings alone do not.
         from sim_backend.prints import Print
         from sim_backend.sheets import Sheet
 
-        return [
-            Sheet(
-                self.placed((0, 0, 0)),
-                self.rotation,
-                self.width_mm,
-                self.height_mm,
-                self.bend_mm,
-                Print.of(self.polygons, self.discs),
-                self.light_reflectance,
-                self.dark_reflectance,
-            )
-        ]
+        sheet = Sheet(
+            self.placed((0, 0, 0)),
+            self.rotation,
+            self.width_mm,
+            self.height_mm,
+            self.bend_mm,
+            Print.of(self.polygons, self.discs),
+            self.light_reflectance,
+            self.dark_reflectance,
+        )
+        return {"board": [sheet]}

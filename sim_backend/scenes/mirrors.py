@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, Self
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -11,7 +12,7 @@ from sim_backend.scenes.pose import Length, Pose, Share
 from sim_backend.surfaces import Material, Sphere, Surface
 
 
-class _BesideMirror(Pose):
+class BesideMirror(Pose):
     """A mirror to the right of an object."""
 
     offset_x_mm: float = Field(-30.0, description="The object's centre to the right of the camera's axis, mm.")
@@ -38,8 +39,8 @@ class _BesideMirror(Pose):
         0.0, description="0 a perfect mirror; else its lobe's standard deviation is √2·roughness² rad."
     )
 
-    def _mirror_from(self, x: float, z: float) -> Surface:
-        """The mirror whose plane meets the scene's y = 0 first at (x, z)."""
+    def _mirror_from(self, x: float, z: float, material: Material | None = None) -> Surface:
+        """The mirror that meets the scene's y = 0 first at (x, z), or something else of another material."""
         angle, tilt = math.radians(self.mirror_angle_deg), math.radians(self.mirror_tilt_deg)
         along = (-math.cos(angle), -math.sin(angle))  # (x, z) away from the foot
         w, h = self.mirror_width_mm / 2, self.mirror_height_mm / 2
@@ -48,49 +49,57 @@ class _BesideMirror(Pose):
             (x + w * along[0], 0, z + w * along[1]),
             (w * along[0], 0, w * along[1]),
             (h * math.sin(tilt) * face[0], h * math.cos(tilt), h * math.sin(tilt) * face[1]),
-            Material(0.0, self.mirror_reflectance, self.mirror_roughness),
+            Material(0.0, self.mirror_reflectance, self.mirror_roughness) if material is None else material,
         )
 
 
-class _Board(_BesideMirror):
+class BoardBesideMirror(BesideMirror):
     """A matt board; the pose's origin is its centre."""
 
     board_width_mm: Length = Field(260.0, description="Width of the board, mm.")
     board_height_mm: Length = Field(250.0, description="Height of the board, mm.")
     board_reflectance: Share = Field(0.8, description="Share of the light that the board scatters evenly.")
 
-    def _board(self) -> Surface:
+    def _board(self, material: Material | None = None) -> Surface:
         w, h = self.board_width_mm / 2, self.board_height_mm / 2
-        return self.rectangle((0, 0, 0), (w, 0, 0), (0, h, 0), Material(self.board_reflectance))
+        return self.rectangle((0, 0, 0), (w, 0, 0), (0, h, 0), material or Material(self.board_reflectance))
 
-    def _mirror(self) -> Surface:
+    def _mirror(self, material: Material | None = None) -> Surface:
         angle = math.radians(self.mirror_angle_deg)
         gap = self.mirror_gap_mm
-        return self._mirror_from(self.board_width_mm / 2 - gap * math.cos(angle), -gap * math.sin(angle))
+        return self._mirror_from(self.board_width_mm / 2 - gap * math.cos(angle), -gap * math.sin(angle), material)
 
 
-class MirrorScene(_Board):
+class MirrorScene(BoardBesideMirror):
     """A white matt board with a plane mirror at its right edge, which throws a bounce on the board."""
+
+    PARTS: ClassVar = ("board", "mirror")
+    MEASURED: ClassVar = ("board",)
 
     name: Literal["mirror"] = "mirror"
 
-    def surfaces(self) -> list[Surface]:
-        """What there is, in the camera frame: board, mirror."""
-        return [self._board(), self._mirror()]
+    def parts(self) -> Mapping[str, Sequence[Surface]]:
+        """What there is by name, in the camera frame."""
+        return {"board": [self._board()], "mirror": [self._mirror()]}
 
 
-class MirrorRemovedScene(_Board):
+class MirrorRemovedScene(BoardBesideMirror):
     """The scene ``mirror`` without its mirror; it takes the same parameters, so that the two compare."""
+
+    PARTS: ClassVar = ("board",)
 
     name: Literal["mirror_removed"] = "mirror_removed"
 
-    def surfaces(self) -> list[Surface]:
-        """What there is, in the camera frame: the board."""
-        return [self._board()]
+    def parts(self) -> Mapping[str, Sequence[Surface]]:
+        """What there is by name, in the camera frame."""
+        return {"board": [self._board()]}
 
 
-class SphereMirrorScene(_BesideMirror):
+class SphereMirrorScene(BesideMirror):
     """A light grey matt ball with a plane mirror to its right, which throws a bounce on it."""
+
+    PARTS: ClassVar = ("ball", "mirror")
+    MEASURED: ClassVar = ("ball",)
 
     name: Literal["sphere_mirror"] = "sphere_mirror"
     radius_mm: Length = Field(45.0, description="Radius of the ball, mm.")
@@ -112,8 +121,13 @@ class SphereMirrorScene(_BesideMirror):
             raise ValueError("distance_mm must exceed radius_mm: the camera is inside the sphere")
         return self
 
-    def surfaces(self) -> list[Surface]:
-        """What there is, in the camera frame: the ball, and the mirror if it is there."""
+    @property
+    def part_names(self) -> tuple[str, ...]:
+        """The ball, and the mirror if it is there."""
+        return ("ball", "mirror") if self.with_mirror else ("ball",)
+
+    def parts(self) -> Mapping[str, Sequence[Surface]]:
+        """What there is by name, in the camera frame."""
         ball = Sphere(self.placed((0, 0, 0)), self.radius_mm, Material(self.reflectance))
         mirror = self._mirror_from(self.radius_mm + self.mirror_gap_mm, -self.mirror_forward_mm)
-        return [ball, mirror] if self.with_mirror else [ball]
+        return {"ball": [ball], "mirror": [mirror]} if self.with_mirror else {"ball": [ball]}

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, Self
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -14,6 +15,8 @@ from sim_backend.surfaces import Sphere, Surface
 class PlaneScene(Pose):
     """A flat board."""
 
+    PARTS: ClassVar = ("board",)
+
     name: Literal["plane"] = "plane"
     yaw_deg: float = Field(10.0, ge=-80, le=80, description="Turn about the vertical, °.")
     pitch_deg: float = Field(5.0, ge=-80, le=80, description="Turn about the horizontal after the yaw, °.")
@@ -21,14 +24,16 @@ class PlaneScene(Pose):
     height_mm: Length = Field(200.0, description="Height, mm.")
     finish: Finish = Field(Finish(), description="The board's surface.")
 
-    def surfaces(self) -> list[Surface]:
-        """What there is, in the camera frame."""
+    def parts(self) -> Mapping[str, Sequence[Surface]]:
+        """What there is by name, in the camera frame."""
         w, h = self.width_mm / 2, self.height_mm / 2
-        return [self.rectangle((0, 0, 0), (w, 0, 0), (0, h, 0), self.finish.material)]
+        return {"board": [self.rectangle((0, 0, 0), (w, 0, 0), (0, h, 0), self.finish.material)]}
 
 
 class SphereScene(Pose):
     """A ball; the pose's origin is its centre."""
+
+    PARTS: ClassVar = ("ball",)
 
     name: Literal["sphere"] = "sphere"
     radius_mm: Length = Field(70.0, description="Radius, mm.")
@@ -40,13 +45,16 @@ class SphereScene(Pose):
             raise ValueError("distance_mm must exceed radius_mm: the camera is inside the sphere")
         return self
 
-    def surfaces(self) -> list[Surface]:
-        """What there is, in the camera frame."""
-        return [Sphere(self.placed((0, 0, 0)), self.radius_mm, self.finish.material)]
+    def parts(self) -> Mapping[str, Sequence[Surface]]:
+        """What there is by name, in the camera frame."""
+        return {"ball": [Sphere(self.placed((0, 0, 0)), self.radius_mm, self.finish.material)]}
 
 
 class StepsScene(Pose):
     """A staircase that comes nearer step by step from left to right, with its risers."""
+
+    PARTS: ClassVar = ("treads", "risers")
+    MEASURED: ClassVar = ("treads",)
 
     name: Literal["steps"] = "steps"
     steps: int = Field(5, ge=2, le=50, description="Number of treads.")
@@ -55,8 +63,8 @@ class StepsScene(Pose):
     height_mm: Length = Field(180.0, description="Height of the treads, mm.")
     finish: Finish = Field(Finish(reflectance=0.6), description="The staircase's surface.")
 
-    def surfaces(self) -> list[Surface]:
-        """What there is, in the camera frame: treads from left to right, then risers."""
+    def parts(self) -> Mapping[str, Sequence[Surface]]:
+        """What there is by name, in the camera frame, each from left to right."""
         half, h, matt = (self.steps - 1) / 2, self.height_mm / 2, self.finish.material
         treads: list[Surface] = [
             self.rectangle(
@@ -76,11 +84,13 @@ class StepsScene(Pose):
             )
             for k in range(self.steps - 1)
         ]
-        return treads + risers
+        return {"treads": treads, "risers": risers}
 
 
 class VGrooveScene(Pose):
     """Two boards that meet in a vertical fold and open towards the camera; each lights the other."""
+
+    PARTS: ClassVar = ("left", "right")
 
     name: Literal["v_groove"] = "v_groove"
     pitch_deg: float = Field(
@@ -97,10 +107,11 @@ class VGrooveScene(Pose):
         Finish(reflectance=0.65, gloss=0.25, roughness=0.08), description="The surface of both faces."
     )
 
-    def surfaces(self) -> list[Surface]:
-        """What there is, in the camera frame: the left face, the right face."""
+    def parts(self) -> Mapping[str, Sequence[Surface]]:
+        """What there is by name, in the camera frame."""
         half, h = math.radians(self.opening_deg / 2), self.height_mm / 2
         x, z = self.face_width_mm / 2 * math.sin(half), self.face_width_mm / 2 * math.cos(half)
-        return [
-            self.rectangle((side * x, 0, -z), (side * x, 0, -z), (0, h, 0), self.finish.material) for side in (-1, 1)
-        ]
+        return {
+            name: [self.rectangle((side * x, 0, -z), (side * x, 0, -z), (0, h, 0), self.finish.material)]
+            for name, side in (("left", -1), ("right", 1))
+        }

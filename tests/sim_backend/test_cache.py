@@ -54,8 +54,15 @@ def test_a_hit_gives_the_very_same_matrices(settings, traced, scene):
     np.testing.assert_array_equal(first.bounced_light(light), second.bounced_light(light))
 
 
-def test_tracing_is_deterministic(settings, tmp_path):
-    _same(transport_of(settings("v_groove")), transport_of(settings("v_groove", cache_dir=tmp_path / "other")))
+@pytest.mark.parametrize("scene", ["v_groove", "fins", "mirror_textured", "mirror_translucent"])
+def test_tracing_is_deterministic(settings, tmp_path, scene):
+    _same(transport_of(settings(scene)), transport_of(settings(scene, cache_dir=tmp_path / "other")))
+
+
+def test_the_cache_keeps_all_of_it(settings):
+    traced, kept = transport_of(settings("mirror_translucent")), transport_of(settings("mirror_translucent"))
+    _same(traced, kept)
+    assert kept.spreads == traced.spreads != ()
 
 
 def _entry(folder):
@@ -141,7 +148,8 @@ def test_memory_keeps_what_was_looked_at_last(settings, traced):
 def test_every_module_that_decides_the_light_is_part_of_the_content():
     """Those that tracing and scenes import, and their imports; of the settings, the values are in the content."""
     folder = Path(cache.__file__).parent
-    found, todo = set(), ["cache", "scenes/boards"]
+    scenes = {f"scenes/{path.stem}" for path in (folder / "scenes").glob("*.py")}
+    found, todo = set(), ["cache", *scenes]
     while todo:
         name = todo.pop()
         found.add(name)
@@ -151,5 +159,4 @@ def test_every_module_that_decides_the_light_is_part_of_the_content():
                 imported = f"{imported}/__init__" if (folder / imported).is_dir() else imported
                 if imported not in found and imported != "settings":
                     todo.append(imported)
-    scenes = {f"scenes/{path.stem}" for path in (folder / "scenes").glob("*.py")}
-    assert set(cache._SOURCES) == found | scenes
+    assert set(cache._SOURCES) == found
