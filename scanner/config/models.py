@@ -26,16 +26,13 @@ from pydantic import (
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from scanner.config.benches import BENCH_GROUP, load_bench_kind
+from scanner.config.methods import METHOD_GROUP, check_method_name, method_names
 from scanner.config.problems import ConfigError, FieldPath, show
 from scanner.config.sections import load_section
 from scanner.patterns import Axis, unambiguous_range
 
 if TYPE_CHECKING:
     from drivers.bench import BenchKind
-
-MethodName = Literal["tps", "mps", "mps_gn", "mfs"]
-METHOD_NAMES: tuple[MethodName, ...] = get_args(MethodName)
-"""Names of the methods; `scanner.methods` holds the methods themselves."""
 
 
 class _Section(BaseModel):
@@ -125,11 +122,15 @@ def _list_or_by_axis(value: Any) -> str:
 class ScanSection(_Section):
     """What is projected, and how the frames are judged."""
 
-    method: MethodName = Field(
+    method: str = Field(
         "mfs",
         description="tps: temporal phase shifting; mps: micro phase shifting with all steps of every period; "
-        "mps_gn: micro phase shifting in Gupta and Nayar's F + 2 patterns; mfs: micro-frequency shifting in two "
-        "rounds.",
+        "mps_gn: micro phase shifting in Gupta and Nayar's F + 2 patterns; modulated: phase shifting under a carrier; "
+        "embedded: embedded phase shifting; xor: XOR code and phase; epipolar: TPS with Qi's check; mfs: "
+        "micro-frequency shifting in two rounds; mfs1: in one; mfs_paper: as its paper has it. Installed packages add "
+        f"more (entry points of the group {METHOD_GROUP}).",
+        # Called when the schema is made, so that it names the methods that are installed then.
+        json_schema_extra=lambda schema: schema.update(enum=list(method_names())),
     )
     axes: tuple[Axis, ...] = Field(
         ("x", "y"),
@@ -209,6 +210,15 @@ class ScanSection(_Section):
         description="Share of camera pixels (0..1) that may be saturated in the preview; with more the scan does "
         "not start and asks for a shorter exposure.",
     )
+
+    @field_validator("method")
+    @classmethod
+    def _method_is_known(cls, method: str) -> str:
+        try:
+            return check_method_name(method)
+        except ConfigError as error:
+            _refuse([_refusal((), error.message, error.remedy)])
+            raise
 
     @model_validator(mode="after")
     def _fields_agree(self) -> Self:
