@@ -11,6 +11,7 @@ from scanner.config.loading import LoadedConfig, load_config, open_bench
 from scanner.config.methods import METHOD_GROUP, METHOD_NAMES, load_stranger, method_names, register_file
 from scanner.config.models import (
     BenchSection,
+    CompareSection,
     Config,
     FrequenciesByAxis,
     GatesSection,
@@ -27,6 +28,7 @@ __all__ = [
     "METHOD_GROUP",
     "METHOD_NAMES",
     "BenchSection",
+    "CompareSection",
     "Config",
     "ConfigError",
     "FrequenciesByAxis",

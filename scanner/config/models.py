@@ -262,6 +262,53 @@ class ScanSection(_Section):
         return tuple(1 / v for v in values) if values is not None and self.periods_px is not None else values
 
 
+class WindowSection(_Section):
+    """A rectangle of the camera's picture with one surface in it."""
+
+    name: str = Field(min_length=1, description="Name in tables and figures, such as W1.")
+    x: int = Field(ge=0, description="Leftmost column, camera px.")
+    y: int = Field(ge=0, description="Topmost row, camera px.")
+    width: int = Field(ge=2, description="Columns.")
+    height: int = Field(ge=2, description="Rows.")
+    fit: Literal["plane", "sphere"] = Field("plane", description="What is fitted to the points in it.")
+
+
+class CompareSection(_Section):
+    """What `scan compare` compares, and where it judges."""
+
+    methods: tuple[str, ...] = Field(
+        ("mfs", "tps", "mps", "mps_gn"), strict=False, min_length=1, description="Names of the methods."
+    )
+    seeds: int = Field(
+        1, ge=1, le=1000, description="How often each method scans; a simulated bench with another seed each time."
+    )
+    windows: tuple[WindowSection, ...] = Field(
+        (),
+        strict=False,
+        description="Where the points are judged after a fit; none: the largest region that a method detected.",
+    )
+    fit: Literal["plane", "sphere"] = Field("plane", description="What is fitted where no window is given.")
+    least_alpha: float = Field(
+        0.02,
+        gt=0,
+        le=1,
+        description="Where the bench knows the truth: a pixel sees a bounce when that has at least this share of the "
+        "direct light's modulation.",
+    )
+
+    @field_validator("methods")
+    @classmethod
+    def _methods_are_known(cls, methods: tuple[str, ...]) -> tuple[str, ...]:
+        refusals = []
+        for place, method in enumerate(methods):
+            try:
+                check_method_name(method)
+            except ConfigError as error:
+                refusals.append(_refusal((place,), error.message, error.remedy))
+        _refuse(refusals)
+        return methods
+
+
 class GatesSection(_Section):
     """What a result must reach; a scan that fails a gate keeps its result and ends with exit code 4."""
 
@@ -348,6 +395,7 @@ class Config(_Section):
     scan: ScanSection = Field(default_factory=ScanSection)
     gates: GatesSection = Field(default_factory=GatesSection)
     output: OutputSection = Field(default_factory=OutputSection)
+    compare: CompareSection = Field(default_factory=CompareSection)
     calibration: SerializeAsAny[BaseModel] | None = Field(
         None,
         description="How `calibrate` makes this bench measurable; null: it is not to be calibrated with this file.",
@@ -365,7 +413,7 @@ class Config(_Section):
             raise
         return model.model_validate(value, context=info.context)
 
-    @field_validator("scan", "gates", "output", mode="before")
+    @field_validator("scan", "gates", "output", "compare", mode="before")
     @classmethod
     def _empty_section_is_all_defaults(cls, value: Any) -> Any:
         # A section whose every line is commented out reads as null.
