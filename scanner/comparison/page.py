@@ -129,11 +129,10 @@ def _cell(mean: float, half: float, kind: str) -> str:
         return "–"
     if kind == "count":
         return number(round(mean))
-    factor, digits = (100.0, 3) if kind == "share" else (1.0, 3)
-    # As many decimals as the mean has of three figures; an interval that small is written with one figure.
+    factor = 100.0 if kind == "share" else 1.0
     value = mean * factor
-    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value)))) if value else 1
-    decimals = min(decimals, {"time": 1, "share": 2, "figure": 4}.get(kind, 5))
+    three_figures = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 1
+    decimals = {"time": 1, "share": 1 if value >= 10 else 2, "figure": 4}.get(kind, min(three_figures, 5))
     text = f"{value:,.{decimals}f}".replace(",", "\u202f") + (" %" if kind == "share" else "")
     if math.isfinite(half) and kind != "time":
         text += f"<small>± {half * factor:.2g}</small>"

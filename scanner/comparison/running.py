@@ -131,13 +131,15 @@ def _facts(loaded: LoadedConfig, shown: Mapping[str, ScanResult], seeds: int) ->
     result = next(iter(shown.values()))
     height, width = result.maps.flags.shape
     first = getattr(loaded.bench_settings, "seed", None)
-    counted = f"{first} to {first + seeds - 1}" if isinstance(first, int) and seeds > 1 else str(first or "")
+    counted = ""
+    if isinstance(first, int):
+        counted = f", seed {first}" if seeds == 1 else f", seeds {first} to {first + seeds - 1}"
     return {
         "Bench": str(result.summary.get("bench", "")),
         "Configuration": loaded.path.name,
         "Date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "Camera": f"{width} × {height} px",
-        "Scans of each": f"{seeds}" + (f", seeds {counted}" if counted else ""),
+        "Scans of each": f"{seeds}{counted}",
         "Version": str(result.summary.get("versions", {}).get("mfs-scanner", "")),
     }
 
