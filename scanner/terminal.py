@@ -161,7 +161,7 @@ class Terminal:
                     written.format(factor * row.mean[k]) if math.isfinite(row.mean[k]) else "–"
                     for k, (_, factor, written) in shown.items()
                 ]
-                table.add_row(row.method, *cells)
+                table.add_row(row.method.upper(), *cells)
             self.console.print()
             self.console.print(table)
         self.console.print(f"report, with intervals and figures: {path / 'report.html'}", markup=False)

@@ -135,7 +135,9 @@ def _cell(mean: float, half: float, kind: str) -> str:
     decimals = {"time": 1, "share": 1 if value >= 10 else 2, "figure": 4}.get(kind, min(three_figures, 5))
     text = f"{value:,.{decimals}f}".replace(",", "\u202f") + (" %" if kind == "share" else "")
     if math.isfinite(half) and kind != "time":
-        text += f"<small>± {half * factor:.2g}</small>"
+        half *= factor
+        two_figures = max(0, 1 - math.floor(math.log10(half))) if half > 0 else 0
+        text += f"<small>± {half:.{min(two_figures, 6)}f}</small>"
     return text
 
 

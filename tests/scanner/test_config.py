@@ -940,11 +940,18 @@ def test_the_demo_is_valid_and_documented_line_by_line(monkeypatch: pytest.Monke
     assert load_config(tmp_path / "config.yaml").config == loaded.config
     # It shows every field of the scanner's own sections.
     document = plain(path)
-    for section, model in (("scan", cfg.ScanSection), ("gates", cfg.GatesSection), ("output", cfg.OutputSection)):
+    for section, model in (
+        ("scan", cfg.ScanSection),
+        ("gates", cfg.GatesSection),
+        ("output", cfg.OutputSection),
+        ("compare", cfg.CompareSection),
+    ):
         assert list(document[section]) == list(model.model_fields)
     lines = [line for line in path.read_text().splitlines() if line.strip() and not line.lstrip().startswith("#")]
     bare = [line.strip() for line in lines if "#" not in line]
-    assert all(re.match(r"(\w+_)?height|camera:|projector:|mirror_height|farthest|pitch|yaw|offset", line) for line in bare), bare
+    assert all(
+        re.match(r"(\w+_)?height|camera:|projector:|mirror_height|farthest|pitch|yaw|offset", line) for line in bare
+    ), bare
 
 
 # --- being light
