@@ -165,7 +165,7 @@ def mirror(scan_simulated):
     return go
 
 
-def test_the_epipolar_check_takes_wrong_points_out_and_misses_weak_errors(mirror):
+def test_the_epipolar_check_finds_what_pulls_off_the_line_and_misses_what_pulls_along_it(mirror):
     maps, truth = mirror("epipolar")
     plain, _ = mirror("tps")
     direct = np.isfinite(truth.x_p) & ~truth.edge
@@ -174,10 +174,15 @@ def test_the_epipolar_check_takes_wrong_points_out_and_misses_weak_errors(mirror
     # Clean pixels: 0.1 % by the choice of the operator, and a binomial's spread.
     assert maps.interreflection[clean].mean() < 0.003
     assert np.isnan(maps.x_p[maps.interreflection]).all()
-    wrong = np.abs(plain.x_p - truth.x_p) > 8
-    assert (np.isfinite(maps.x_p) & wrong & bounce).sum() < 0.2 * (wrong & bounce).sum()
-    # Along the epipolar line nothing pulls a pair off: some errors stay.
-    assert (np.isfinite(maps.x_p) & bounce).any()
+    # The baseline is level: what pulls y pulls off the line and is found, a wrong fringe of x stays on it.
+    kept = bounce & np.isfinite(maps.x_p)
+    assert kept.sum() > 100
+    assert (np.abs(maps.y_p - truth.y_p)[kept] < 1).mean() > 0.99
+    assert (np.abs(maps.x_p - truth.x_p)[kept] > 1).mean() > 0.1
+    # It takes out more than the tolerance of 1 px, which every method has for the calibration's sake, does.
+    off = (plain.flags & np.uint16(Flag.OFF_EPIPOLAR)) != 0
+    assert maps.interreflection[off & bounce].all()
+    assert maps.interreflection[bounce].sum() > 1.05 * (off & bounce).sum()
 
 
 def test_the_papers_rule_leaves_emitters_lit_where_this_projects_does_not(mirror):
