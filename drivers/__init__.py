@@ -1,6 +1,6 @@
 """What a device is, and the real ones. Knows nobody else."""
 
-from drivers.bench import Bench, BenchKind, LatencyBound, Presenter
+from drivers.bench import Bench, BenchKind, LatencyBound, Presenter, SceneTruth, TruthTeller
 from drivers.clock import SystemClock
 from drivers.devices import (
     Camera,
@@ -65,6 +65,7 @@ __all__ = [
     "Presenter",
     "Projector",
     "ProtocolError",
+    "SceneTruth",
     "SequenceFaultError",
     "SequencePlayer",
     "SteppedBench",
@@ -72,5 +73,6 @@ __all__ = [
     "SystemClock",
     "Trigger",
     "TriggerCounts",
+    "TruthTeller",
     "WatchedProjector",
 ]

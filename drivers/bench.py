@@ -116,6 +116,47 @@ class Presenter(Protocol):
         ...
 
 
+class SceneTruth(Protocol):
+    """What really is before a bench, all (height, width) of its camera; NaN is "none"."""
+
+    @property
+    def x_p(self) -> NDArray[np.floating[Any]]:
+        """Projector column, px, that directly lights what the pixel's centre sees."""
+        ...
+
+    @property
+    def y_p(self) -> NDArray[np.floating[Any]]:
+        """Projector row, px, as `x_p`."""
+        ...
+
+    @property
+    def points(self) -> NDArray[np.floating[Any]]:
+        """(height, width, 3) mm in the camera frame."""
+        ...
+
+    @property
+    def alpha(self) -> NDArray[np.floating[Any]]:
+        """Amplitude of the bounced fringes over that of the direct ones."""
+        ...
+
+    @property
+    def edge(self) -> NDArray[np.bool_]:
+        """Pixels that mix two surfaces, or light and shadow."""
+        ...
+
+
+@runtime_checkable
+class TruthTeller(Protocol):
+    """A bench kind that knows what is really there: a simulation, or a bench with a measured artefact.
+
+    Nothing that computes a result asks it; `scan compare` does, to judge results.
+    """
+
+    def truth(self, settings: Any) -> SceneTruth:
+        """Truth of the bench that ``settings`` (an instance of the kind's model) describes."""
+        ...
+
+
 @runtime_checkable
 class LatencyBound(Protocol):
     """A bench that has to know how much later than handed over a picture is on the surface."""

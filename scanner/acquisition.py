@@ -285,7 +285,7 @@ class Acquisition:
         collected = self.method.collect(plan, self.bench.frame_format)
         self._enter(ScanState.CAPTURING, f"round {number} of {self.method.rounds}")
         fmt = self.bench.frame_format
-        longest = max(len(s.fringes) for s in plan.sequences)
+        longest = max(len(s) for s in plan.sequences)
         # Two buffers take turns: one is being filled while the other is checked and demodulated.
         buffers = [np.zeros((longest, *fmt.shape), fmt.dtype) for _ in range(2)]
         queue = [(sequence, 1) for sequence in range(len(plan.sequences))]
@@ -304,7 +304,7 @@ class Acquisition:
                     if queue:
                         sequence, attempt = queue.pop(0)
                         attempts[sequence] = attempt
-                        frames = buffers[turn % 2][: len(plan.sequences[sequence].fringes)]
+                        frames = buffers[turn % 2][: len(plan.sequences[sequence])]
                         try:
                             self._expose_sequence(number, plan, sequence, attempt, frames, total)
                         except HardwareError as error:
@@ -428,7 +428,7 @@ class Acquisition:
 
     def _again(self, number: int, plan: Plan, sequence: int, attempt: int, reason: str) -> list[tuple[int, int]]:
         fringes = plan.sequences[sequence]
-        self.repeats += len(fringes.fringes)
+        self.repeats += len(fringes)
         self._enter(ScanState.REPEATING, f"{fringes.label}, attempt {attempt + 1}")
         self._note(f"round {number}, {fringes.label}: {reason}; the sequence was taken again")
         self._enter(ScanState.CAPTURING, f"round {number} of {self.method.rounds}")

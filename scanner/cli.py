@@ -46,7 +46,9 @@ GATES_FAILED = 4
 def scan(
     context: typer.Context,
     config: Annotated[Path | None, typer.Option("--config", "-c", help="Bench file (YAML).")] = None,
-    method: Annotated[str | None, typer.Option("--method", "-m", help="mfs, tps, mps or mps_gn.")] = None,
+    method: Annotated[
+        str | None, typer.Option("--method", "-m", help="Name of a method, such as mfs or tps, or FILE.py.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Result folder; default: scan-<time>.")] = None,
     overwrite: OverwriteOption = False,
     quiet: QuietOption = False,
@@ -61,7 +63,7 @@ def scan(
     from scanner.config import load_config
     from scanner.terminal import Terminal
 
-    loaded = load_config(config, overrides(sets, method))
+    loaded = load_config(config, overrides(sets, None if method is None else _known(method)))
     terminal = Terminal(quiet)
     terminal.say(loaded.warnings)
     result, path = _scan(loaded, out or _default_out("scan"), overwrite, terminal)
@@ -77,7 +79,10 @@ def process(
     config: Annotated[Path | None, typer.Option("--config", "-c", help="Its scan section replaces the take's.")] = None,
     plan: Annotated[Path | None, typer.Option("--plan", help="Plan file of a folder of images.")] = None,
     rig: Annotated[Path | None, typer.Option("--rig", help="Rig: own JSON or OpenCV FileStorage.")] = None,
-    method: Annotated[str, typer.Option("--method", "-m", help="How images are decoded: tps, mps or mfs.")] = "tps",
+    method: Annotated[
+        str,
+        typer.Option("--method", "-m", help="How images are decoded: tps, mps, mfs …; or FILE.py of a take's method."),
+    ] = "tps",
     min_modulation: Annotated[
         float | None, typer.Option("--min-modulation", help="Least fringe modulation of a valid pixel, DN.")
     ] = None,
@@ -91,6 +96,7 @@ def process(
     from scanner.terminal import Terminal
 
     terminal = Terminal(quiet)
+    method = _known(method)
     if (source / "take" / MANIFEST).exists():
         source = source / "take"
     chosen_rig = Rig.load(rig) if rig is not None else None
@@ -132,7 +138,11 @@ def process(
 @interruptible
 def compare(
     config: ConfigOption,
-    methods: Annotated[str, typer.Option("--methods", help="Comma-separated names.")] = "mfs,tps,mps,mps_gn",
+    methods: Annotated[
+        str | None, typer.Option("--methods", help="Comma-separated names, or files FILE.py; default: compare.methods.")
+    ] = None,
+    seeds: Annotated[int | None, typer.Option("--seeds", min=1, help="Scans of each method, for intervals.")] = None,
+    fit: Annotated[str | None, typer.Option("--fit", help="plane or sphere, where no window is configured.")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder; default: comparison-<time>.")] = None,
     reuse: Annotated[
         Path | None, typer.Option("--reuse", help="A result folder of this scene: its method is not scanned again.")
@@ -141,32 +151,35 @@ def compare(
     quiet: QuietOption = False,
     sets: SetOption = None,
 ) -> None:
-    """Scan with several methods and tabulate their errors after a plane fit in the largest bounce region."""
-    from scanner import comparison
+    """Scan with several methods: one table of errors, one report with the figures, over several seeds."""
+    from scanner.comparison.running import Planned, plan_scans, run_comparison
     from scanner.config import load_config
     from scanner.folder import ComparisonFolder, read_result
     from scanner.terminal import Terminal
 
     terminal = Terminal(quiet)
-    results: dict[str, ScanResult] = {}
-    names = [name.strip() for name in methods.split(",") if name.strip()]
-    loads = {name: load_config(config, overrides(sets, name)) for name in names}
+    changes = overrides(sets)
+    if methods is not None:
+        changes["compare.methods"] = [_known(name.strip()) for name in methods.split(",") if name.strip()]
+    if seeds is not None:
+        changes["compare.seeds"] = seeds
+    if fit is not None:
+        changes["compare.fit"] = fit
+    section = load_config(config, changes).config.compare
+    scans = plan_scans(lambda more: load_config(config, {**changes, **more}), section.methods, section.seeds)
+    known = None if reuse is None else read_result(reuse)
+    command = ["scan", "compare", "--config", str(config), "--methods", methods or ",".join(section.methods)]
+    command += ["--seeds", str(section.seeds), *(word for s in sets or [] for word in ("--set", s))]
+    command += ["--fit", fit] if fit is not None else []
     with ComparisonFolder(out or _default_out("comparison"), overwrite=overwrite) as folder:
-        if reuse is not None:
-            known = read_result(reuse)
-            results[known.method] = known
-        for name in names:
-            if name not in results:
-                results[name], _ = _scan(loads[name], folder.path / name, False, terminal)
-        results = {name: results[name] for name in names}
-        region = next((r.maps.interreflection for r in results.values() if r.maps.interreflection.any()), None)
-        if region is None:
-            terminal.say(["no method of these detected a bounce: the whole picture is compared"])
-            region = next(iter(results.values())).maps.valid
-        rows, maps = comparison.compare(results, comparison.largest_region(region))
-        simulated = any(r.simulated for r in results.values())
-        comparison.picture(maps, rows, folder.path / "comparison.png", simulated)
-        folder.write_json("comparison.json", {"simulated": simulated, "rows": comparison.to_json(rows)})
+
+        def scan(planned: Planned) -> ScanResult:
+            if known is not None and planned.number == 0 and planned.method == known.method:
+                return known
+            terminal.say([f"{planned.method}, scan {planned.number + 1} of {section.seeds}"])
+            return _scan(planned.loaded, folder.path / planned.folder, False, terminal)[0]
+
+        rows = run_comparison(scans, scan, section, folder, command)
     terminal.comparison(rows, folder.out)
 
 
@@ -354,6 +367,15 @@ def _scan(loaded: LoadedConfig, out: Path, overwrite: bool, terminal: Terminal) 
     from scanner.session import run_scan
 
     return run_scan(loaded, out, overwrite, terminal)
+
+
+def _known(method: str) -> str:
+    """Name of a method; of a Python file the name of the method in it, which the process then knows."""
+    if not method.endswith(".py"):
+        return method
+    from scanner.config import register_file
+
+    return register_file(method)
 
 
 def _sections(

@@ -1,8 +1,8 @@
-"""What is projected: a `Plan` of fringe sequences, parametric and rendered on demand.
+"""What is projected: a `Plan` of pattern sequences, parametric and rendered on demand.
 
-Pattern n of a sequence is ``A + B cos(2π f u + φ_n)`` with the projector coordinate u (px, pixel centres at integers)
-along one axis and, in this project's own plans, φ_n = 2π n / N, n = 1..N (method.md §1; Optics Express 27(20) 28293,
-Eq. 15).
+Pattern n of a `FringeSequence` is ``A + B cos(2π f u + φ_n)`` with the projector coordinate u (px, pixel centres at
+integers) along one axis and, in this project's own plans, φ_n = 2π n / N, n = 1..N (method.md §1; Optics Express 27(20)
+28293, Eq. 15). Patterns of any other profile along the axis, such as codes, are a `ProfileSequence`.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any, Literal
 
 import numpy as np
@@ -35,10 +36,14 @@ class Fringe:
     frequency: float
     step_rad: float
 
+    def profile(self, extent: int) -> NDArray[np.float64]:
+        """(extent,) cosine at the projector pixels along the fringe's axis, -1..1."""
+        return np.asarray(np.cos(2 * np.pi * self.frequency * np.arange(extent) + self.step_rad))
+
 
 @dataclass(frozen=True)
 class FringeSequence:
-    """Patterns that are captured, checked and repeated together.
+    """Fringes that are captured, checked and repeated together.
 
     Parameters
     ----------
@@ -46,10 +51,17 @@ class FringeSequence:
         ``"x"``: the fringes vary along the projector's columns; ``"y"``: along its rows.
     fringes
         The patterns in the order they are shown.
+    carrier
+        A fringe along the *other* axis that the light of every pattern is multiplied by, as (1 + cos)/2; None for plain
+        fringes.
     """
 
     axis: Axis
     fringes: tuple[Fringe, ...]
+    carrier: Fringe | None = None
+
+    def __len__(self) -> int:
+        return len(self.fringes)
 
     @property
     def frequency(self) -> float | None:
@@ -67,7 +79,115 @@ class FringeSequence:
         """Short name for messages, such as ``x 1/16 px``."""
         if self.frequency is None:
             return f"{self.axis} {len({f.frequency for f in self.fringes})} periods"
-        return f"{self.axis} 1/{1 / self.frequency:.5g} px"
+        carried = "" if self.carrier is None else f" carrier {math.degrees(self.carrier.step_rad):.0f}°"
+        return f"{self.axis} 1/{1 / self.frequency:.5g} px{carried}"
+
+    def light(self, size: tuple[int, int], mean: float, amplitude: float) -> list[NDArray[np.float64]]:
+        """Light of each pattern as a fraction of full scale, broadcastable to the projector's (height, width)."""
+        lines = [_along(self.axis, mean + amplitude * f.profile(_extent(size, self.axis))) for f in self.fringes]
+        if self.carrier is None:
+            return lines
+        other: Axis = "y" if self.axis == "x" else "x"
+        carrier = _along(other, 0.5 + 0.5 * self.carrier.profile(_extent(size, other)))
+        return [line * carrier for line in lines]
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON-ready document."""
+        document: dict[str, Any] = {"axis": self.axis, "fringes": [[f.frequency, f.step_rad] for f in self.fringes]}
+        if self.carrier is not None:
+            document["carrier"] = [self.carrier.frequency, self.carrier.step_rad]
+        return document
+
+
+@dataclass(frozen=True)
+class ProfileSequence:
+    """Patterns of any profile along one axis that are captured, checked and repeated together.
+
+    Parameters
+    ----------
+    axis
+        As in `FringeSequence`.
+    name
+        Short name for messages, such as ``XOR code``.
+    profiles
+        (N, extent) for each pattern its light at every projector pixel along the axis: -1 the darkest, 1 the brightest.
+        A pattern that is another's inverse lets the sequence's check see more.
+
+    Raises
+    ------
+    ValueError
+        No patterns, patterns of different lengths, or values outside -1..1.
+    """
+
+    axis: Axis
+    name: str
+    profiles: tuple[tuple[float, ...], ...]
+
+    def __post_init__(self) -> None:
+        if len({len(p) for p in self.profiles}) != 1:
+            raise ValueError(f"{self.name}: a sequence needs patterns, and all of the same length")
+        if not all(-1 <= v <= 1 for p in self.profiles for v in p):
+            raise ValueError(f"{self.name}: a profile lies within -1..1")
+
+    def __len__(self) -> int:
+        return len(self.profiles)
+
+    @property
+    def frequency(self) -> None:
+        """None: these are no fringes of one frequency."""
+        return
+
+    @property
+    def label(self) -> str:
+        """Short name for messages, such as ``x XOR code``."""
+        return f"{self.axis} {self.name}"
+
+    def light(self, size: tuple[int, int], mean: float, amplitude: float) -> list[NDArray[np.float64]]:
+        """As `FringeSequence.light`.
+
+        Raises
+        ------
+        ValueError
+            The profiles do not have the projector's length.
+        """
+        if len(self.profiles[0]) != _extent(size, self.axis):
+            raise ValueError(f"{self.label}: profiles of {len(self.profiles[0])} px for a projector of {size} px")
+        return [_along(self.axis, mean + amplitude * np.array(p)) for p in self.profiles]
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON-ready document; every profile as its runs [value, px]."""
+        runs = [[[value, len(list(same))] for value, same in groupby(p)] for p in self.profiles]
+        return {"axis": self.axis, "name": self.name, "profiles": runs}
+
+
+PatternSequence = FringeSequence | ProfileSequence
+"""What a plan consists of: both have ``axis``, ``label``, ``frequency``, a length, ``light`` and ``to_json``."""
+
+
+def patterns_in(document: Mapping[str, Any]) -> int:
+    """Number of patterns in the document of a sequence."""
+    return len(document["profiles"] if "profiles" in document else document["fringes"])
+
+
+def sequence_from_json(document: Mapping[str, Any]) -> PatternSequence:
+    """Inverse of both ``to_json``."""
+    if "profiles" in document:
+        profiles = tuple(tuple(v for value, px in runs for v in [value] * px) for runs in document["profiles"])
+        return ProfileSequence(document["axis"], document["name"], profiles)
+    carrier = document.get("carrier")
+    return FringeSequence(
+        document["axis"],
+        tuple(Fringe(f, step) for f, step in document["fringes"]),
+        None if carrier is None else Fringe(*carrier),
+    )
+
+
+def _extent(size: tuple[int, int], axis: Axis) -> int:
+    return size[0] if axis == "x" else size[1]
+
+
+def _along(axis: Axis, line: NDArray[np.float64]) -> NDArray[np.float64]:
+    return line[None] if axis == "x" else line[:, None]
 
 
 def phase_steps(axis: Axis, frequency: float, steps: int) -> FringeSequence:
@@ -105,7 +225,7 @@ class Plan:
     """
 
     size: tuple[int, int]
-    sequences: tuple[FringeSequence, ...]
+    sequences: tuple[PatternSequence, ...]
     mean: float = 0.5
     amplitude: float = 0.5
     mask: NDArray[np.bool_] | None = field(default=None, compare=False)
@@ -126,7 +246,7 @@ class Plan:
     @property
     def frame_count(self) -> int:
         """Patterns in the whole plan."""
-        return sum(len(s.fringes) for s in self.sequences)
+        return sum(len(s) for s in self.sequences)
 
     @property
     def axes(self) -> tuple[Axis, ...]:
@@ -135,11 +255,24 @@ class Plan:
 
     def first_slot(self, sequence: int) -> int:
         """Plan index of the first pattern of sequence ``sequence``."""
-        return sum(len(s.fringes) for s in self.sequences[:sequence])
+        return sum(len(s) for s in self.sequences[:sequence])
 
     def extent(self, axis: Axis) -> int:
         """Projector pixels along ``axis``."""
-        return self.size[0] if axis == "x" else self.size[1]
+        return _extent(self.size, axis)
+
+    def fringes(self, axis: Axis) -> tuple[FringeSequence, ...]:
+        """The sequences of ``axis`` in plan order.
+
+        Raises
+        ------
+        ValueError
+            One of them shows no fringes.
+        """
+        chosen = tuple(s for s in self.sequences if s.axis == axis)
+        if others := [s.label for s in chosen if not isinstance(s, FringeSequence)]:
+            raise ValueError(f"{', '.join(others)}: a phasor needs fringes")
+        return chosen  # type: ignore[return-value]
 
     def grey(self, light: ArrayLike) -> NDArray[np.uint8]:
         """Grey levels that come nearest to ``light`` (fractions of full scale, any shape)."""
@@ -149,14 +282,10 @@ class Plan:
 
     def render(self, sequence: int) -> list[NDArray[np.uint8]]:
         """(height, width) 8-bit pictures of one sequence, in the grey levels whose light comes nearest."""
-        chosen = self.sequences[sequence]
         width, height = self.size
-        u = np.arange(self.extent(chosen.axis), dtype=np.float64)
         pictures = []
-        for fringe in chosen.fringes:
-            line = self.mean + self.amplitude * np.cos(2 * np.pi * fringe.frequency * u + fringe.step_rad)
-            grey = self.grey(line)
-            picture = np.broadcast_to(grey if chosen.axis == "x" else grey[:, None], (height, width))
+        for light in self.sequences[sequence].light(self.size, self.mean, self.amplitude):
+            picture = np.broadcast_to(self.grey(light), (height, width))
             if self.mask is not None:
                 picture = np.where(self.mask, picture, np.uint8(0))
             pictures.append(np.ascontiguousarray(picture))
@@ -168,9 +297,7 @@ class Plan:
             "size": list(self.size),
             "mean": self.mean,
             "amplitude": self.amplitude,
-            "sequences": [
-                {"axis": s.axis, "fringes": [[f.frequency, f.step_rad] for f in s.fringes]} for s in self.sequences
-            ],
+            "sequences": [s.to_json() for s in self.sequences],
             "mask": None if self.mask is None else _run_lengths(self.mask),
             "response": None if self.response is None else list(self.response),
         }
@@ -182,10 +309,7 @@ class Plan:
         mask, response = document.get("mask"), document.get("response")
         return cls(
             size=(width, height),
-            sequences=tuple(
-                FringeSequence(s["axis"], tuple(Fringe(f, step) for f, step in s["fringes"]))
-                for s in document["sequences"]
-            ),
+            sequences=tuple(sequence_from_json(s) for s in document["sequences"]),
             mean=document["mean"],
             amplitude=document["amplitude"],
             mask=None if mask is None else _from_run_lengths(mask, (height, width)),

@@ -15,7 +15,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from drivers import FrameFormat, NoiseModel, Pixels
 from scanner import kernels
-from scanner.patterns import Axis, Plan
+from scanner.patterns import Axis, FringeSequence, Plan
 
 _SECOND_DERIVATIVES = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 """Second derivative across and along: blind to whatever is smooth (Immerkær, CVIU 64, 300 (1996))."""
@@ -100,9 +100,9 @@ class RoundPhasors:
             Wrong shape, a sequence that was added before, or patterns of several frequencies.
         """
         fringes = self.plan.sequences[sequence]
-        if fringes.frequency is None:
-            raise ValueError(f"sequence {fringes.label} mixes frequencies: it has no phasor of its own")
-        if frames.shape != (len(fringes.fringes), *self.frame_format.shape):
+        if not isinstance(fringes, FringeSequence) or fringes.frequency is None:
+            raise ValueError(f"sequence {fringes.label} is not one fringe: it has no phasor of its own")
+        if frames.shape != (len(fringes), *self.frame_format.shape):
             raise ValueError(f"frames {frames.shape} for sequence {fringes.label} of {self.frame_format.shape} pixels")
         if sequence in self.added:
             raise ValueError(f"sequence {fringes.label} was added before")
@@ -188,7 +188,7 @@ class RoundPhasors:
 
     def _stack(self, axis: Axis) -> AxisPhasors:
         if axis not in self._stacks:
-            sequences = [s for s in self.plan.sequences if s.axis == axis]
+            sequences = self.plan.fringes(axis)
             counts = {len(s.fringes) for s in sequences}
             if len(counts) > 1:
                 raise ValueError(f"the {axis} sequences have different numbers of steps {sorted(counts)}")

@@ -59,6 +59,9 @@ class Maps:
         χ² per degree of freedom of the one-path fit, over all axes, and how many degrees of freedom that are.
     interreflection
         bool, the detected region.
+    score
+        The statistic that the detection compares with its threshold, larger where a bounce is likelier; None for
+        methods that detect none.
     flags
         uint16, `Flag`.
     depth
@@ -97,6 +100,7 @@ class Maps:
     misfit_round2: NDArray[np.float32] | None = None
     lit: NDArray[np.bool_] | None = None
     regional_pattern: Pixels | None = None
+    score: NDArray[np.float32] | None = None
 
     @property
     def valid(self) -> NDArray[np.bool_]:

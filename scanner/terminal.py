@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,11 +16,11 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from scanner.acquisition import Progress, ScanState
-from scanner.comparison import Row
 from scanner.quality import passed
 from scanner.result import ScanResult
 
 if TYPE_CHECKING:
+    from scanner.comparison import Row
     from scanner.design import DesignedPlan
 
 _PLAIN_EVERY_S = 2.0
@@ -184,22 +185,37 @@ class Terminal:
 
     def comparison(self, rows: Sequence[Row], path: Path) -> None:
         """Print the table of a comparison."""
-        table = Table(title="bounce region after a plane fit", title_justify="left", pad_edge=False)
-        for name in ("method", "frames", "covered", "std, mm", "median |error|, mm", "> 1 mm", "seconds"):
-            table.add_column(name, justify="left" if name == "method" else "right")
-        for row in rows:
-            table.add_row(
-                row.method.upper(),
-                str(row.frames),
-                f"{100 * row.coverage:.1f} %",
-                f"{row.std_mm:.4g}",
-                f"{row.median_mm:.4g}",
-                f"{100 * row.outliers:.2f} %",
-                f"{row.seconds:.1f}",
+        columns = {
+            "coverage": ("cov %", 100, "{:.1f}"),
+            "std_mm": ("std mm", 1, "{:.4g}"),
+            "median_mm": ("med mm", 1, "{:.3g}"),
+            "rmse_mm": ("rmse mm", 1, "{:.4g}"),
+            "wrong_fringes": ("wrong %", 100, "{:.2f}"),
+            "precision": ("prec", 1, "{:.3f}"),
+            "recall": ("recall", 1, "{:.3f}"),
+            "auc": ("AUC", 1, "{:.3f}"),
+            "frames": ("frames", 1, "{:.0f}"),
+            "seconds": ("s", 1, "{:.0f}"),
+        }
+        for window in dict.fromkeys(row.window for row in rows):
+            mine = [row for row in rows if row.window == window]
+            shown = {k: c for k, c in columns.items() if any(math.isfinite(row.mean[k]) for row in mine)}
+            seeds = f", means of {mine[0].seeds} scans" if mine[0].seeds > 1 else ""
+            table = Table(
+                title=f"{window} after a fit{seeds}", title_justify="left", box=None, pad_edge=False, padding=(0, 1)
             )
-        self.console.print()
-        self.console.print(table)
-        self.console.print(f"pictures and figures: {path}", markup=False)
+            table.add_column("method", no_wrap=True)
+            for name, _, _ in shown.values():
+                table.add_column(name, justify="right", no_wrap=True)
+            for row in mine:
+                cells = [
+                    written.format(factor * row.mean[k]) if math.isfinite(row.mean[k]) else "–"
+                    for k, (_, factor, written) in shown.items()
+                ]
+                table.add_row(row.method.upper(), *cells)
+            self.console.print()
+            self.console.print(table)
+        self.console.print(f"report, with intervals and figures: {path / 'report.html'}", markup=False)
 
     def detection_study(self, document: Mapping[str, Any], path: Path) -> None:
         """Print the tables of a detection study."""

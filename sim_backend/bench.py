@@ -62,6 +62,10 @@ class SimulatedBenchKind:
         ) as bench:
             yield bench
 
+    def truth(self, settings: SimulatedSettings) -> Truth:
+        """What is really there; see `drivers.TruthTeller`."""
+        return truth_of(settings)
+
 
 @cache
 def _transports() -> RecentTransports:

@@ -8,13 +8,13 @@ the entry-point group ``scanner.benches``, so that any installed package can add
 
 from scanner.config.benches import BENCH_GROUP, bench_kinds, load_bench_kind
 from scanner.config.loading import LoadedConfig, load_config, open_bench
+from scanner.config.methods import METHOD_GROUP, METHOD_NAMES, load_stranger, method_names, register_file
 from scanner.config.models import (
-    METHOD_NAMES,
     BenchSection,
+    CompareSection,
     Config,
     FrequenciesByAxis,
     GatesSection,
-    MethodName,
     OutputSection,
     PeriodsByAxis,
     ScanSection,
@@ -25,14 +25,15 @@ from scanner.config.schema import json_schema
 
 __all__ = [
     "BENCH_GROUP",
+    "METHOD_GROUP",
     "METHOD_NAMES",
     "BenchSection",
+    "CompareSection",
     "Config",
     "ConfigError",
     "FrequenciesByAxis",
     "GatesSection",
     "LoadedConfig",
-    "MethodName",
     "OutputSection",
     "PeriodsByAxis",
     "Problem",
@@ -42,5 +43,8 @@ __all__ = [
     "json_schema",
     "load_bench_kind",
     "load_config",
+    "load_stranger",
+    "method_names",
     "open_bench",
+    "register_file",
 ]

@@ -26,16 +26,13 @@ from pydantic import (
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from scanner.config.benches import BENCH_GROUP, load_bench_kind
+from scanner.config.methods import METHOD_GROUP, check_method_name, method_names
 from scanner.config.problems import ConfigError, FieldPath, show
 from scanner.config.sections import load_section
 from scanner.patterns import Axis, unambiguous_range
 
 if TYPE_CHECKING:
     from drivers.bench import BenchKind
-
-MethodName = Literal["tps", "mps", "mps_gn", "mfs"]
-METHOD_NAMES: tuple[MethodName, ...] = get_args(MethodName)
-"""Names of the methods; `scanner.methods` holds the methods themselves."""
 
 
 class _Section(BaseModel):
@@ -125,11 +122,15 @@ def _list_or_by_axis(value: Any) -> str:
 class ScanSection(_Section):
     """What is projected, and how the frames are judged."""
 
-    method: MethodName = Field(
+    method: str = Field(
         "mfs",
         description="tps: temporal phase shifting; mps: micro phase shifting with all steps of every period; "
-        "mps_gn: micro phase shifting in Gupta and Nayar's F + 2 patterns; mfs: micro-frequency shifting in two "
-        "rounds.",
+        "mps_gn: micro phase shifting in Gupta and Nayar's F + 2 patterns; modulated: phase shifting under a carrier; "
+        "embedded: embedded phase shifting; xor: XOR code and phase; epipolar: TPS with Qi's check; mfs: "
+        "micro-frequency shifting in two rounds; mfs1: in one; mfs_paper: as its paper has it. Installed packages add "
+        f"more (entry points of the group {METHOD_GROUP}).",
+        # Called when the schema is made, so that it names the methods that are installed then.
+        json_schema_extra=lambda schema: schema.update(enum=list(method_names())),
     )
     axes: tuple[Axis, ...] = Field(
         ("x", "y"),
@@ -211,6 +212,15 @@ class ScanSection(_Section):
         "not start and asks for a shorter exposure.",
     )
 
+    @field_validator("method")
+    @classmethod
+    def _method_is_known(cls, method: str) -> str:
+        try:
+            return check_method_name(method)
+        except ConfigError as error:
+            _refuse([_refusal((), error.message, error.remedy)])
+            raise
+
     @model_validator(mode="after")
     def _fields_agree(self) -> Self:
         refusals = []
@@ -251,6 +261,53 @@ class ScanSection(_Section):
         given = self.frequencies_per_px if self.periods_px is None else self.periods_px
         values = getattr(given, axis) if isinstance(given, BaseModel) else given
         return tuple(1 / v for v in values) if values is not None and self.periods_px is not None else values
+
+
+class WindowSection(_Section):
+    """A rectangle of the camera's picture with one surface in it."""
+
+    name: str = Field(min_length=1, description="Name in tables and figures, such as W1.")
+    x: int = Field(ge=0, description="Leftmost column, camera px.")
+    y: int = Field(ge=0, description="Topmost row, camera px.")
+    width: int = Field(ge=2, description="Columns.")
+    height: int = Field(ge=2, description="Rows.")
+    fit: Literal["plane", "sphere"] = Field("plane", description="What is fitted to the points in it.")
+
+
+class CompareSection(_Section):
+    """What `scan compare` compares, and where it judges."""
+
+    methods: tuple[str, ...] = Field(
+        ("mfs", "tps", "mps", "mps_gn"), strict=False, min_length=1, description="Names of the methods."
+    )
+    seeds: int = Field(
+        1, ge=1, le=1000, description="How often each method scans; a simulated bench with another seed each time."
+    )
+    windows: tuple[WindowSection, ...] = Field(
+        (),
+        strict=False,
+        description="Where the points are judged after a fit; none: the largest region that a method detected.",
+    )
+    fit: Literal["plane", "sphere"] = Field("plane", description="What is fitted where no window is given.")
+    least_alpha: float = Field(
+        0.02,
+        gt=0,
+        le=1,
+        description="Where the bench knows the truth: a pixel sees a bounce when that has at least this share of the "
+        "direct light's modulation.",
+    )
+
+    @field_validator("methods")
+    @classmethod
+    def _methods_are_known(cls, methods: tuple[str, ...]) -> tuple[str, ...]:
+        refusals = []
+        for place, method in enumerate(methods):
+            try:
+                check_method_name(method)
+            except ConfigError as error:
+                refusals.append(_refusal((place,), error.message, error.remedy))
+        _refuse(refusals)
+        return methods
 
 
 class GatesSection(_Section):
@@ -339,6 +396,7 @@ class Config(_Section):
     scan: ScanSection = Field(default_factory=ScanSection)
     gates: GatesSection = Field(default_factory=GatesSection)
     output: OutputSection = Field(default_factory=OutputSection)
+    compare: CompareSection = Field(default_factory=CompareSection)
     calibration: SerializeAsAny[BaseModel] | None = Field(
         None,
         description="How `calibrate` makes this bench measurable; null: it is not to be calibrated with this file.",
@@ -356,7 +414,7 @@ class Config(_Section):
             raise
         return model.model_validate(value, context=info.context)
 
-    @field_validator("scan", "gates", "output", mode="before")
+    @field_validator("scan", "gates", "output", "compare", mode="before")
     @classmethod
     def _empty_section_is_all_defaults(cls, value: Any) -> Any:
         # A section whose every line is commented out reads as null.

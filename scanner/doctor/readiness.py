@@ -63,7 +63,7 @@ class Planned:
     @property
     def memory_bytes(self) -> int:
         """About the largest memory of the scan: two sequences of frames, and what decoding keeps of every sequence."""
-        longest = max(len(s.fringes) for s in self.plan.sequences)
+        longest = max(len(s) for s in self.plan.sequences)
         kept = _BYTES_PER_PIXEL + _BYTES_PER_PIXEL_AND_SEQUENCE * len(self.plan.sequences)
         return 2 * longest * self.frame_bytes + kept * self.size[0] * self.size[1]
 

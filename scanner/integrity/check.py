@@ -13,6 +13,7 @@ from scanner.integrity.codes import wrong_codes
 from scanner.integrity.findings import SEQUENCE, Finding, SequenceCheck
 from scanner.integrity.history import SequenceHistory
 from scanner.integrity.naming import culprits
+from scanner.integrity.profiles import check_pairs
 from scanner.integrity.sampling import Grid, grid, unsaturated
 from scanner.integrity.steps import wrong_steps
 from scanner.integrity.waveform import (
@@ -26,7 +27,7 @@ from scanner.integrity.waveform import (
     of_own_fringe,
     other_mean,
 )
-from scanner.patterns import FringeSequence
+from scanner.patterns import FringeSequence, PatternSequence, ProfileSequence
 
 _OWN_REDUNDANCY = 8
 """Steps from which the frames of a sequence tell every error of a single one by themselves."""
@@ -52,16 +53,17 @@ def repeated_frames(frames: Sequence[Pixels] | Pixels) -> list[tuple[int, int]]:
 
 
 def check_sequence(
-    frames: Pixels, fringes: FringeSequence, saturated_dn: int, history: SequenceHistory | None = None
+    frames: Pixels, planned: PatternSequence, saturated_dn: int, history: SequenceHistory | None = None
 ) -> SequenceCheck:
-    """Compare what (N, H, W) ``frames`` show with what ``fringes`` asks for.
+    """Compare what (N, H, W) ``frames`` show with what ``planned`` asks for.
 
     Parameters
     ----------
     frames
         (N, H, W) grey values.
-    fringes
-        The plan of the sequence.
+    planned
+        The plan of the sequence. Of fringes under a carrier, whose mean and modulation are not those of other
+        sequences, and of what shows no fringes (`scanner.integrity.profiles`) the history neither tells nor learns.
     saturated_dn
         Grey value from which a pixel is left out.
     history
@@ -69,10 +71,17 @@ def check_sequence(
         it may belong to another pattern altogether or begin at another step, and with three steps, or one of each
         frequency, only repeated frames are found.
     """
-    count = len(fringes.fringes)
+    if history and (isinstance(planned, ProfileSequence) or planned.carrier is not None):
+        history.ended(np.empty(0, np.float32), good=False)
+        history = None
+    count = len(planned)
     findings = [
         Finding(j, f"frame {j + 1} is frame {i + 1} over again, to the last bit") for i, j in repeated_frames(frames)
     ]
+    if isinstance(planned, ProfileSequence):
+        more, share, blind = check_pairs(frames, planned, saturated_dn)
+        return SequenceCheck(tuple(findings + more), np.full(count, np.nan), share, blind)
+    fringes = planned
     cells = grid(frames.shape[1:])
     values = cells.take_all(frames)
     valid = unsaturated(values, saturated_dn)

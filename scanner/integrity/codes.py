@@ -105,4 +105,4 @@ def _decoded(
 
     part = FringeSequence(fringes.axis, tuple(fringes.fringes[n] for n in kept))
     frames: Any = values[kept][:, None, pixels]
-    return nearest_code(frames, part, extent, NoiseModel(sigma_dn))[0]
+    return nearest_code(frames, part, extent, NoiseModel(sigma_dn)).coordinates

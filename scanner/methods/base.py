@@ -86,11 +86,16 @@ class FirstRound:
 
 
 class Method(Protocol):
-    """One way to scan."""
+    """One way to scan; `OneRound` is a base for those that need no second round."""
 
     @property
     def name(self) -> str:
         """Name in configurations and tables."""
+        ...
+
+    @property
+    def title(self) -> str:
+        """Name for people, and the paper it is from."""
         ...
 
     @property
@@ -117,6 +122,93 @@ class Method(Protocol):
     def fuse(self, first: FirstRound, second: RoundFrames, setup: Setup) -> Maps:
         """Join both rounds."""
         ...
+
+
+@dataclass
+class KeptFrames:
+    """The frames of each sequence as they are, for methods that take few enough of them."""
+
+    plan: Plan
+    frame_format: FrameFormat
+    added: set[int] = field(default_factory=set)
+    frames: dict[int, Pixels] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.saturated: NDArray[np.bool_] = np.zeros(self.frame_format.shape, bool)
+
+    def add(self, sequence: int, frames: Pixels) -> None:
+        """Take over the (N, H, W) frames of a sequence."""
+        self.frames[sequence] = frames.copy()
+        self.saturated |= (frames >= self.frame_format.saturated_dn).any(axis=0)
+        self.added.add(sequence)
+
+    def estimate_noise(self) -> NoiseModel | None:
+        """The camera's own model is taken."""
+        return None
+
+
+class OneRound:
+    """What methods without a second round share; they add ``name``, ``title``, ``first_round`` and ``decode``."""
+
+    rounds: int = 1
+
+    def collect(self, plan: Plan, frame_format: FrameFormat) -> RoundFrames:
+        """Keep the frames as they are."""
+        return KeptFrames(plan, frame_format)
+
+    def second_round(self, first: FirstRound, setup: Setup) -> Plan | None:
+        """Nothing follows."""
+        return None
+
+    def fuse(self, first: FirstRound, second: RoundFrames, setup: Setup) -> Maps:
+        """Nothing follows, so round one stands."""
+        return first.maps
+
+
+@dataclass(frozen=True)
+class MeasuredAxis:
+    """One axis of a round of `KeptFrames`: coordinates, mean grey value and noise of the phasor, (H, W), DN."""
+
+    coordinates: Coordinates
+    mean: NDArray[np.float32]
+    sigma_z: NDArray[np.float32]
+
+
+def undetected_maps(axes: Sequence[MeasuredAxis], saturated: NDArray[np.bool_], setup: Setup) -> Maps:
+    """Maps of a round that detects no bounces, points included where a rig is known.
+
+    Raises
+    ------
+    PlanError
+        There is no axis.
+    """
+    if not axes:
+        raise PlanError("the frames hold no complete axis", "Record at least the frames of one axis.")
+    amplitudes = [m.coordinates.amplitude for m in axes]
+    kept = {
+        m.coordinates.axis: keep_clear(
+            m.coordinates, usable_pixels(m.coordinates.amplitude, m.sigma_z, saturated, setup.scan)
+        )
+        for m in axes
+    }
+    usable = usable_pixels(np.minimum.reduce(amplitudes), axes[0].sigma_z, saturated, setup.scan)
+    misfits = [m.coordinates.chi2 / np.float32(m.coordinates.dof) for m in axes]
+    x, sigma_x = kept.get("x", (None, None))
+    y, sigma_y = kept.get("y", (None, None))
+    maps = Maps(
+        x_p=x,
+        y_p=y,
+        sigma_x=sigma_x,
+        sigma_y=sigma_y,
+        modulation=np.asarray(np.mean(amplitudes, axis=0), np.float32),
+        brightness=np.mean([m.mean for m in axes], axis=0, dtype=np.float32),
+        variation=None,
+        misfit=np.mean(misfits, axis=0, dtype=np.float32),
+        misfit_dof=sum(m.coordinates.dof for m in axes),
+        interreflection=np.zeros(usable.shape, bool),
+        flags=first_flags(usable, saturated, [u for u, _ in kept.values()]),
+    )
+    return refuse_off_epipolar(maps, setup.rig)
 
 
 def stepped_plan(

@@ -109,6 +109,7 @@ class MicroFrequencyShifting:
     """MFS, two rounds."""
 
     name: str = "mfs"
+    title: str = "Micro-frequency shifting, two rounds (after Opt. Express 27, 28293)"
     rounds: int = 2
 
     def first_round(self, scan: ScanSection, size: tuple[int, int]) -> Plan:
@@ -168,6 +169,7 @@ class MicroFrequencyShifting:
             flags=flags,
             x_p_round1=maps.x_p,
             y_p_round1=maps.y_p,
+            score=detection.statistic,
         )
         return FirstRound(refuse_off_epipolar(first, setup.rig), frames.plan, _Private(decoded, detection, separated))
 

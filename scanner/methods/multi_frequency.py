@@ -18,6 +18,7 @@ from scanner.config import ScanSection
 from scanner.interreflection import misfit_statistic
 from scanner.methods.base import (
     FirstRound,
+    OneRound,
     PlanError,
     RoundFrames,
     Setup,
@@ -36,20 +37,20 @@ MPS_PERIODS_PX = (14.57, 16.09, 16.24, 16.67, 16.60)
 
 
 @dataclass(frozen=True)
-class MultiFrequency:
+class MultiFrequency(OneRound):
     """N steps of each of several frequencies, one round.
 
     Parameters
     ----------
-    name
-        Name of the method.
+    name, title
+        Name of the method, and in words.
     own_frequencies
         Frequencies (1/px) for an axis of so many projector pixels.
     """
 
     name: str
+    title: str
     own_frequencies: Callable[[int], Sequence[float]]
-    rounds: int = 1
 
     def first_round(self, scan: ScanSection, size: tuple[int, int]) -> Plan:
         """Plan of the only round."""
@@ -67,17 +68,15 @@ class MultiFrequency:
         maps, _ = one_path_maps(frames, decoded, setup)
         return FirstRound(refuse_off_epipolar(maps, setup.rig), frames.plan)
 
-    def second_round(self, first: FirstRound, setup: Setup) -> Plan | None:
-        """Nothing follows."""
-        return None
 
-    def fuse(self, first: FirstRound, second: RoundFrames, setup: Setup) -> Maps:
-        """Nothing follows, so round one stands."""
-        return first.maps
-
-
-temporal_phase_shifting = MultiFrequency("tps", lambda extent: (1 / 16, 10 / extent, 1 / extent))
-micro_phase_shifting = MultiFrequency("mps", lambda extent: tuple(1 / p for p in MPS_PERIODS_PX))
+temporal_phase_shifting = MultiFrequency(
+    "tps", "Temporal phase shifting", lambda extent: (1 / 16, 10 / extent, 1 / extent)
+)
+micro_phase_shifting = MultiFrequency(
+    "mps",
+    "Micro phase shifting, N steps of every frequency (as Opt. Express 27, 28293 ran it)",
+    lambda extent: tuple(1 / p for p in MPS_PERIODS_PX),
+)
 
 
 @dataclass(frozen=True)

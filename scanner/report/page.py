@@ -19,11 +19,6 @@ from scanner.report.wording import length, listing, number, per_cent, section, t
 from scanner.result import Flag, Maps, ScanResult
 from scanner.rig import Rig
 
-_METHODS = {
-    "mfs": "Micro-frequency shifting, two rounds",
-    "mps": "Micro phase shifting",
-    "tps": "Temporal phase shifting",
-}
 _MARKS = {"passed": "✓", "failed": "✗", "none": "○"}
 
 
@@ -89,7 +84,7 @@ def _header(result: ScanResult, title: str) -> str:
         verdict, kind = f"all {len(gates)} quality gates passed", "passed"
     created, method = result.summary.get("created"), result.method
     facts = {
-        "Method": " · ".join(filter(None, (method.upper(), _METHODS.get(method)))),
+        "Method": " · ".join(filter(None, (method, _title(method)))),
         "Bench": result.summary.get("bench"),
         "Date": created and str(created).replace("T", " ").replace("+00:00", " UTC"),
         "Camera": "{1} × {0} px".format(*result.maps.flags.shape),
@@ -103,6 +98,13 @@ def _header(result: ScanResult, title: str) -> str:
         f'<header><div><h1>{escape(title)}</h1><p class="verdict {kind}">{_MARKS[kind]} {verdict}</p>'
         f"<dl>{listed}</dl></div>{simulated}</header>"
     )
+
+
+def _title(method: str) -> str | None:
+    """What the method calls itself; None for one that is not installed here."""
+    from scanner.methods import METHODS
+
+    return METHODS[method].title if method in METHODS else None
 
 
 def _key_figures(result: ScanResult) -> str:

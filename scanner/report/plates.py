@@ -126,7 +126,7 @@ def _change(axis: str, fused: Array, first: Array, region: NDArray[np.bool_]) ->
     moved = np.abs(change[np.isfinite(change)])
     reach = max(float(np.percentile(moved, 99)), 0.05) if moved.size else 1.0
     some, far = (per_cent(float((moved > limit).mean())) if moved.size else "–" for limit in (0.5, 8))
-    rows, columns = _window(region)
+    rows, columns = window_around(region)
     title = f"{axis}<sub>p</sub> fused minus round one"
     return _signed(f"change-{axis}", title, change[rows, columns], "px", reach).figure(
         f"What one path would have got wrong in the region, cut out: {some} of it moved by more than 0.5 px, {far} by "
@@ -134,7 +134,7 @@ def _change(axis: str, fused: Array, first: Array, region: NDArray[np.bool_]) ->
     )
 
 
-def _window(region: NDArray[np.bool_]) -> tuple[slice, slice]:
+def window_around(region: NDArray[np.bool_]) -> tuple[slice, slice]:
     """Rows and columns around ``region`` with some air, in the aspect of the picture; all of it where it is empty."""
     height, width = region.shape
     rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))

@@ -128,9 +128,10 @@ def observe(
 ) -> Observed:
     """Frames of a plan, rounded to whole DN, and what the first round makes of them."""
     shape = scene.alpha.shape
-    plan = Plan(size, tuple(phase_steps(a, f, steps) for a, fs in frequencies.items() for f in fs))
+    sequences = tuple(phase_steps(a, f, steps) for a, fs in frequencies.items() for f in fs)
+    plan = Plan(size, sequences)
     collected = RoundPhasors(plan, FrameFormat(shape[1], shape[0], 12))
-    for number, sequence in enumerate(plan.sequences):
+    for number, sequence in enumerate(sequences):
         frequency, axis = sequence.fringes[0].frequency, sequence.axis
         u = scene.direct[axis]
         first, second = 2 * np.pi * frequency * u, 2 * np.pi * frequency * (u + scene.delta[axis])

@@ -22,6 +22,7 @@ import numpy as np
 
 from drivers.devices import Clock, FrameFormat, FrameStamp, Pixels
 from drivers.errors import OperatorError
+from scanner.patterns import patterns_in
 from scanner.take.journal import (
     FRAMES,
     GIVEN,
@@ -219,7 +220,7 @@ class TakeWriter:
             self._check_open()
             if self._rounds.get(round) == plan:
                 return
-            self._reserve(self._next_slot + sum(len(s["fringes"]) for s in plan["sequences"]))
+            self._reserve(self._next_slot + sum(patterns_in(s) for s in plan["sequences"]))
             self._append("round_begun", round=round, plan=plan)
             self._sync(self._journal_fd)
             self._rounds[round], self._plan_checksums[round] = plan, digest(text)
@@ -468,7 +469,7 @@ class TakeWriter:
         """Return the number of frames that the plan has in a sequence."""
         if round not in self._rounds:
             raise ValueError(f"round {round} has not begun")
-        return len(self._rounds[round]["sequences"][sequence]["fringes"])
+        return patterns_in(self._rounds[round]["sequences"][sequence])
 
     def _check_open(self) -> None:
         if self._ended:
