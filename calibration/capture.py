@@ -212,8 +212,8 @@ def photographed(bench: Bench, plan: Plan) -> Iterator[tuple[int, Pixels]]:
     fmt = bench.frame_format
     frames = np.empty((0, *fmt.shape), fmt.dtype)
     for number, sequence in enumerate(plan.sequences):
-        if len(frames) != len(sequence.fringes):
-            frames = np.empty((len(sequence.fringes), *fmt.shape), fmt.dtype)
+        if len(frames) != len(sequence):
+            frames = np.empty((len(sequence), *fmt.shape), fmt.dtype)
         for attempt in range(1, _ATTEMPTS + 1):
             try:
                 bench.prepare(plan.render(number))

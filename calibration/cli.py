@@ -6,6 +6,7 @@ acceptance fails; 130 interrupted or stopped. The same command goes on where it 
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -14,6 +15,7 @@ import typer
 from scanner.command_line import ConfigOption, QuietOption, SetOption, interruptible, new_app, overrides, run
 
 Paper = Literal["A4", "A3", "A2", "A1", "A0", "sheet"]
+StepName = StrEnum("StepName", ["focus", "exposure", "latency", "response", "geometry", "acceptance"])
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
@@ -37,7 +39,7 @@ def calibrate(
     out: OutOption = Path("calibration-result"),
     headless: HeadlessOption = False,
     step: Annotated[
-        list[str] | None,
+        list[StepName] | None,
         typer.Option("--step", help="Only this step, again if it is done; may be given several times."),
     ] = None,
     quiet: QuietOption = False,
@@ -49,10 +51,11 @@ def calibrate(
     if config is None:
         typer.echo(context.get_help())
         raise typer.Exit(2)
+    from calibration.guide.guidance import STEPS
     from calibration.wizard import run_steps
 
     with _work(config, out, headless, quiet, sets) as work:
-        if not run_steps(work, step or ()):
+        if not run_steps(work, [name for name in STEPS if name in (step or ())]):
             raise typer.Exit(FAILED)
 
 
@@ -85,14 +88,12 @@ def verify(
     sets: SetOption = None,
 ) -> None:
     """Accept a rig: scan the artefacts of the bench file with it and write the certificate."""
-    from calibration.acceptance.figures import Verdict
-    from calibration.folder import RIG
-    from calibration.steps import acceptance
+    from calibration.wizard import accepted, rig_to_use
 
+    chosen = rig_to_use(rig, out)
     with _work(config, out, headless, quiet, sets) as work:
-        verdict = acceptance.run(work, rig or work.folder.path / RIG)
-    if verdict in (Verdict.FAIL, Verdict.UNCERTAIN, Verdict.MISSING):
-        raise typer.Exit(FAILED)
+        if not accepted(work, chosen, anew=True):
+            raise typer.Exit(FAILED)
 
 
 @app.command()
@@ -106,11 +107,12 @@ def check(
     sets: SetOption = None,
 ) -> None:
     """Say from one pose of the board whether the stored rig still holds."""
-    from calibration.folder import RIG
     from calibration.steps import drift
+    from calibration.wizard import rig_to_use
 
+    chosen = rig_to_use(rig, out)
     with _work(config, out, headless, quiet, sets) as work:
-        if not drift.run(work, rig or work.folder.path / RIG):
+        if not drift.run(work, chosen):
             raise typer.Exit(FAILED)
 
 

@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 
 _CLEAR_OF_EDGES_PX = 3.0  # a lens's blur of 0.8 px shifts the light by 0.0004 px there, and by 0.2 px at 1 px
 _CLEAR_OF_EDGES_SHARE = 0.12  # of the pitch, where that is less
-_WINDOW = 0.95  # of the pitch, from the point: the four squares that meet there
+_WINDOW = 0.5  # of the pitch, from the point: no pixel tells of two points, so that their errors are independent
 _LIT_SHARE = 0.4  # of the modulation of white paper nearby; print in black has 0.1 or so
 _FEWEST_PIXELS = 24
 _ENOUGH_PIXELS = 100  # around a point; where there are fewer, pixels nearer to print are taken as well

@@ -5,7 +5,9 @@ steps.json      what each step has found, written anew as a whole after each; fo
 takes/          the raw captures; what was cut off is kept as <name>.cut-off, <name>.cut-off-2 …
 poses/          one .npz for each board pose: what camera and projector see of the board's points
 rig.json        the result of the geometry step; rig.opencv.yaml, the same for others
-acceptance/     result folders of the artefacts' scans; certificate.html and certificate.json
+acceptance/     result folders of the artefacts' scans
+certificate.html, certificate.json
+What is made anew keeps its former version under another name: rig.former.json, acceptance.former …
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -141,6 +144,13 @@ class CalibrationFolder:
             place.rename(_free(place, "former" if _complete(place) else "cut-off"))
         return place
 
+    def new_scan(self, name: str) -> Path:
+        """Place for the result folder ``name`` of the acceptance; what is there is kept under another name."""
+        place = self.path / "acceptance" / name
+        if place.exists():
+            place.rename(_free(place, "former"))
+        return place
+
     def poses(self) -> list[PoseObservation]:
         """The poses that were taken, in order."""
         return [_read_pose(file) for file in sorted((self.path / "poses").glob("pose-*.npz"))]
@@ -167,6 +177,15 @@ class CalibrationFolder:
         """Begin the geometry anew; nothing is deleted."""
         for file in sorted((self.path / "poses").glob("pose-*.npz")):
             self.drop_pose(file.stem)
+        for name in (RIG, OPENCV_RIG):
+            if (self.path / name).exists():
+                (self.path / name).rename(_free(self.path / name, "former"))
+
+    def drop_scans(self) -> None:
+        """Begin the acceptance anew; the former scans stay, as ``acceptance.former``."""
+        place = self.path / "acceptance"
+        place.rename(_free(place, "former"))
+        place.mkdir()
 
 
 def read_steps(path: Path) -> dict[str, Any]:
@@ -205,19 +224,20 @@ def _complete(take: Path) -> bool:
 
 
 def _free(place: Path, suffix: str) -> Path:
-    """First of ``<place>``, ``<place>.<suffix>``, ``<place>.<suffix>-2`` … that is free."""
+    """First of ``<place>``, ``<place>.<suffix>``, ``<place>.<suffix>-2`` … that is free; a file keeps its ending."""
+    stem, ending = (place.name, "") if place.is_dir() else (place.stem, place.suffix)
     free, number = place, 0
     while free.exists():
         number += 1
-        free = place.with_name(f"{place.name}.{suffix}" + (f"-{number}" if number > 1 else ""))
+        free = place.with_name(f"{stem}.{suffix}" + (f"-{number}" if number > 1 else "") + ending)
     return free
 
 
 def _read_pose(file: Path) -> PoseObservation:
     try:
-        with np.load(file, allow_pickle=False) as stored:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             arrays = {f.name: stored[f.name] for f in fields(PoseObservation)}
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise CalibrationFolderError(
             f"{file} cannot be read: {error}", "Remove it and take the pose again, or restore it from a copy."
         ) from None

@@ -14,6 +14,7 @@ from calibration.guide.guidance import Bar, Curve, Step
 from calibration.observations import BoardPose
 from calibration.settings import HandSettings
 from drivers import Bench, OperatorError, Presenter
+from scanner.rig import Lens
 
 
 class Answer(StrEnum):
@@ -37,6 +38,11 @@ class StoppedError(OperatorError):
     exit_code = 130
 
 
+def stopped(what: str = "stopped by the operator") -> StoppedError:
+    """The error of an operator who leaves for now."""
+    return StoppedError(what, "Everything so far is kept; the same command goes on from here.")
+
+
 @dataclass(frozen=True)
 class Request:
     """What the operator is asked to hold, and why there.
@@ -57,6 +63,8 @@ class Request:
         What is gained by it.
     bars
         How well is known by now what the step is to find.
+    lens
+        The camera's, as it is known by now.
     """
 
     step: Step
@@ -66,6 +74,7 @@ class Request:
     exact: bool = False
     reason: str = ""
     bars: tuple[Bar, ...] = ()
+    lens: Lens | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +85,7 @@ class Outcome:
     ----------
     step
         Of the calibration.
-    lines
+    text
         The figures in words.
     notes
         Warnings, each with what to do.
@@ -87,7 +96,7 @@ class Outcome:
     """
 
     step: Step
-    lines: tuple[str, ...]
+    text: str
     notes: tuple[str, ...] = ()
     curve: Curve | None = None
     bars: tuple[Bar, ...] = ()
@@ -105,7 +114,7 @@ class Operator(Protocol):
         ...
 
     def place(self, bench: Bench, what: str, scene: Mapping[str, Any]) -> Answer:
-        """Have an artefact placed: ``what`` in words, ``scene`` as the document that a `drivers.Presenter` takes."""
+        """Have an artefact placed: ``what`` says how, ``scene`` is the document for a `drivers.Presenter`."""
         ...
 
     def wait(self, what: str, done: int, total: int) -> None:
@@ -203,7 +212,12 @@ def _presenter(bench: Bench) -> Presenter:
 
 
 def wording(pose: BoardPose) -> str:
-    """A pose in words, for somebody who stands before the bench and looks towards it."""
+    """Where to hold the board, for somebody who stands before the bench and looks towards it."""
+    return f"Hold the board {whereabouts(pose)}."
+
+
+def whereabouts(pose: BoardPose) -> str:
+    """A pose in words."""
     turns = []
     if abs(pose.yaw_deg) >= 5:
         turns.append(f"{'left' if pose.yaw_deg < 0 else 'right'} edge {abs(pose.yaw_deg):.0f}° towards the camera")
@@ -222,4 +236,4 @@ def wording(pose: BoardPose) -> str:
     place = f"{pose.distance_mm / 10:.0f} cm from the camera" + (
         f", {' and '.join(where)} in its picture" if where else ""
     )
-    return f"Hold the board {place}; {', '.join(turns) if turns else 'facing the camera'}."
+    return f"{place}; {', '.join(turns) if turns else 'facing the camera'}"

@@ -16,21 +16,17 @@ from numpy.typing import NDArray
 from calibration.boards import Board
 from calibration.focus import CAMERA_SPOT_PX, EdgeBlur, edge_blur
 from calibration.folder import CalibrationFolder
+from calibration.ghost import Ghost
 from calibration.guide.guidance import Bar, Guidance, Step
 from calibration.guide.lines import GuideLines
 from calibration.guide.window import Guide, GuideWindow, guide_for
 from calibration.looking import Looking, glimpsed
-from calibration.observations import BoardPose, BoardView
-from calibration.operators import Answer, Outcome, Request, StoppedError, UnattendedError
-from calibration.planning import placed, pose_of
-from calibration.planning.glimpse import guessed_lens, held, outline
+from calibration.observations import BoardView
+from calibration.operators import Answer, Outcome, Request, UnattendedError, stopped
 from calibration.settings import CalibrationSettings
 from drivers import Bench, HardwareError, OperatorError, Pixels
 from scanner.preview.measures import focus_measure, read_frame
-from scanner.rig import Lens
 from scanner.terminal import Terminal
-
-Array = NDArray[np.float64]
 
 _ANSWERS = {"space": Answer.TAKE, "s": Answer.SKIP, "b": Answer.BACK, "q": Answer.STOP}
 _LEVELS = (40, 80, 160, 255)
@@ -82,7 +78,8 @@ class PersonOperator:
     def hold_board(self, bench: Bench, board: Board, request: Request) -> Answer:
         """Show the live picture, the board in it and where it is wanted, until the person presses a key."""
         fmt = bench.frame_format
-        ghost = _Ghost.of(self._settings, self._folder, board, (fmt.width, fmt.height)) if request.exact else None
+        size = fmt.width, fmt.height
+        ghost = Ghost.of(self._settings, self._folder, board, size, request.lens) if request.exact else None
         is_focusing = request.step == "focus"
 
         def look(frame: Pixels) -> _Sight:
@@ -121,8 +118,8 @@ class PersonOperator:
         def guidance(frame: Pixels, focus: float) -> Guidance:
             return Guidance(
                 step="acceptance",
-                title=what,
-                instruction=f"Place this: {what}. Nothing may move until the scan is done.",
+                title="artefacts",
+                instruction=what,
                 frame=frame,
                 frame_format=fmt,
                 simulated=bench.simulated,
@@ -145,7 +142,7 @@ class PersonOperator:
                 self._shown,
                 title=what,
                 instruction="Hold still: nothing may move.",
-                bars=(Bar(what, share, True, f"{done} of {total}"),),
+                bars=(Bar(what, share, True, f"{done} of {total}"),) if total else (),
                 board_wanted=False,
                 zone=None,
                 hints=(),
@@ -153,9 +150,7 @@ class PersonOperator:
             )
         )
         if "q" in keys:
-            raise StoppedError(
-                "stopped by the operator", "Everything so far is kept; the same command goes on from here."
-            )
+            raise stopped()
 
     def tell(self, good: bool, text: str) -> None:
         """Flash and ring: whoever holds a board looks elsewhere."""
@@ -163,38 +158,45 @@ class PersonOperator:
             self._guide.flash(good, text)
 
     def learn(self, outcome: Outcome) -> None:
-        """Show figures, curve and warnings until a key is pressed."""
-        if self._still(
+        """Show figures, curve and warnings until a key is pressed; without a window the terminal has said it all."""
+        if not isinstance(self._guide, GuideWindow) or self._still(
             outcome.step,
             "done",
-            " · ".join(outcome.lines),
+            outcome.text,
             (("space", "go on"), ("q", "stop; resume later")),
             bars=outcome.bars,
             curve=outcome.curve,
             hints=outcome.notes,
         ):
             return
-        raise StoppedError("stopped by the operator", "Everything so far is kept; the same command goes on from here.")
+        raise stopped()
 
     def again(self, step: Step, error: OperatorError, what: str) -> bool:
         """Show what is wrong and what to do, until the person has done it or leaves."""
         if self._guide is None:
             return False
-        self._terminal.say([f"{step}: {error}"])
+        if isinstance(self._guide, GuideWindow):
+            self._terminal.say([f"{step}: {error}"])
         hints = tuple(error.remedy.splitlines())
         keys = (("space", what), ("q", "stop; resume later"))
         self._guide.flash(False, f"{step}: not yet")
         return self._still(step, "to be mended", error.message.replace("\n", " · "), keys, hints=hints)
 
-    def _still(
-        self, step: Step, title: str, instruction: str, keys: tuple[tuple[str, str], ...], **more: Any
-    ) -> bool:
+    def _still(self, step: Step, title: str, instruction: str, keys: tuple[tuple[str, str], ...], **more: Any) -> bool:
         """Show the last picture with something to read; whether the person goes on. True where nothing is shown yet."""
         if self._guide is None or self._shown is None:
             return True
         last = self._shown
         shown = Guidance(
-            step, title, instruction, last.frame, last.frame_format, last.simulated, **more, board_wanted=False, keys=keys
+            step,
+            title,
+            instruction,
+            last.frame,
+            last.frame_format,
+            last.simulated,
+            **more,
+            board_wanted=False,
+            keys=keys,
         )
         self._guide.show(shown)
         while True:
@@ -248,61 +250,16 @@ class PersonOperator:
 
     def _guide_of(self, bench: Bench) -> Guide:
         if self._guide is None:
-            guide = guide_for(bench.describe(), self._terminal.console)
+            guide: Guide = guide_for(bench.describe(), self._terminal.console)
             if isinstance(guide, GuideLines) and not sys.stdin.isatty():
                 raise UnattendedError(
                     "there is neither a screen to show on nor a terminal to read keys from",
                     "Run `calibrate` in a terminal, or set DISPLAY to the desktop you sit at; with --headless a bench "
                     "that can do it presents the boards itself.",
                 )
-            self._guide = self._stack.enter_context(guide)
+            self._stack.enter_context(guide)
+            self._guide = guide
         return self._guide
-
-
-@dataclass(frozen=True, eq=False)
-class _Ghost:
-    """Where earlier poses were, by a lens that is guessed from the first: enough to lead a hand."""
-
-    lens: Lens | None
-    board: Board
-    seen: Array
-    poses: tuple[BoardPose, ...]
-    depth_range_mm: tuple[float, float]
-
-    @classmethod
-    def of(
-        cls, settings: CalibrationSettings, folder: CalibrationFolder, board: Board, size: tuple[int, int]
-    ) -> _Ghost:
-        """Of the poses that the folder holds."""
-        geometry, taken = settings.geometry, folder.poses()
-        depths = geometry.nearest_mm, geometry.farthest_mm
-        if not taken:
-            return cls(None, board, np.empty((0, 2)), (), depths)
-        lens = guessed_lens(taken[0].points_board, taken[0].camera, sum(depths) / 2, size)
-        poses = tuple(pose_of(*held(lens, p.points_board, p.camera)) for p in taken)
-        return cls(lens, board, np.concatenate([p.camera for p in taken]), poses, depths)
-
-    def shown(self, plain: Guidance, wanted: BoardPose) -> Guidance:
-        """The guidance with target, outline and maps."""
-        if self.lens is None:
-            return plain
-        size, view, here, now = self.board.size_mm, plain.view, None, None
-        if view is not None:
-            here = held(self.lens, self.board.points[view.ids], view.xy)
-            now = pose_of(*here)
-        return replace(
-            plain,
-            target=outline(self.lens, size, *placed(wanted)),
-            outline=None if here is None else outline(self.lens, size, *here),
-            seen=self.seen,
-            tilts=np.array([(p.yaw_deg, p.pitch_deg) for p in self.poses]).reshape(-1, 2),
-            held_tilt=None if now is None else (now.yaw_deg, now.pitch_deg),
-            wanted_tilt=(wanted.yaw_deg, wanted.pitch_deg),
-            distances_mm=np.array([p.distance_mm for p in self.poses]),
-            held_distance_mm=None if now is None else now.distance_mm,
-            wanted_distance_mm=wanted.distance_mm,
-            depth_range_mm=self.depth_range_mm,
-        )
 
 
 def _steady(bench: Bench, level: int) -> list[NDArray[np.uint8]]:

@@ -60,6 +60,13 @@ class GeometrySettings(_Section):
     farthest_mm: _Length = Field(700.0, description="Farthest distance of the board from the camera, mm.")
     tilt_deg: float = Field(30.0, ge=10, le=50, description="How far the board may be tilted, °.")
     steps: int = Field(12, ge=5, le=64, description="Phase steps of each fringe; 5 or more show harmonics.")
+    board_sigma_mm: float | None = Field(
+        None,
+        gt=0,
+        le=1,
+        description="How far the print's points lie from where they should, mm (standard deviation); they are then "
+        "estimated with the rig. null: the board is exact.",
+    )
     bend: bool = Field(False, description="Estimate a bending of the board as well; needs twelve poses or more.")
 
     @model_validator(mode="after")

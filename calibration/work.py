@@ -12,7 +12,7 @@ from calibration.capture import Occasion
 from calibration.folder import CalibrationFolder
 from calibration.guide.guidance import Bar, Curve, Step
 from calibration.observations import BoardPose, Finding
-from calibration.operators import Answer, Operator, Outcome, Request, StoppedError
+from calibration.operators import Answer, Operator, Outcome, Request, stopped
 from calibration.settings import CalibrationSettings
 from drivers import Bench, DisplayLatency, LatencyBound, OperatorError
 from scanner.acquisition import Listener, Progress, ScanState
@@ -125,9 +125,7 @@ class Work:
         with self.counting(f"{what}: frame") as count:
             yield FrameCounter(count, self.terminal.note)
 
-    def hold_facing(
-        self, bench: Bench, step: Step, title: str, instruction: str, *, nearest: bool = False
-    ) -> None:
+    def hold_facing(self, bench: Bench, step: Step, title: str, instruction: str, *, nearest: bool = False) -> None:
         """Have the board held in the middle of the working volume, or where it is brightest, facing the camera.
 
         Raises
@@ -149,8 +147,24 @@ class Work:
         lines: Sequence[str],
         curve: Curve | None = None,
         bars: tuple[Bar, ...] = (),
+        large: str = "",
     ) -> None:
         """Tell what a step has found, keep it, and stop where it cannot be gone on with.
+
+        Parameters
+        ----------
+        step
+            Which.
+        document
+            What is kept in the folder, JSON-ready.
+        findings
+            What is wrong with it.
+        lines
+            The figures in words, for the terminal.
+        curve, bars
+            The same as the operator's screen shows them.
+        large
+            What the screen writes large; empty for all lines.
 
         Raises
         ------
@@ -166,7 +180,7 @@ class Work:
         if any(f.refuses for f in findings):
             raise StepFailedError.of(step, findings)
         self.folder.finish(step, {**document, "findings": [vars(f) for f in findings]})
-        self.operator.learn(Outcome(step, tuple(lines), tuple(notes), curve, bars))
+        self.operator.learn(Outcome(step, large or " · ".join(lines), tuple(notes), curve, bars))
 
 
 @dataclass
@@ -194,8 +208,3 @@ class FrameCounter:
     def note(self, text: str) -> None:
         """Show what was repeated, and why."""
         self.remark(text)
-
-
-def stopped(what: str = "stopped by the operator") -> StoppedError:
-    """The error of an operator who leaves for now."""
-    return StoppedError(what, "Everything so far is kept; the same command goes on from here.")

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import math
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from calibration.acceptance import PlaneArtefact, SphereArtefact
+from calibration.acceptance.evaluation import evaluate
 from calibration.boards import Board, Chessboard
 from calibration.bundle import calibrate_rig
 from calibration.capture import Occasion, capture_fringes
 from calibration.correspondence import observe
-from calibration.detection import find_board
+from calibration.detection import BoardNotFoundError, find_board
 from calibration.observations import BoardPose, PoseObservation
 from calibration.photometry import response_of_ramp, take_ramp
 from calibration.planning import first_poses, grid, next_pose
@@ -30,6 +33,7 @@ from scanner.result import Maps
 from scanner.rig import Rig
 from scanner.triangulation import triangulate
 from sim_backend.bench import kind
+from sim_backend.scenes import PlaneScene
 from sim_backend.settings import SimulatedSettings
 from sim_backend.stage import SimulatedBench
 
@@ -193,7 +197,8 @@ def in_sigmas(found: Calibration, true_rig: Rig) -> dict[str, float]:
     """Errors of all parameters over their standard uncertainties."""
     true = truth(true_rig)
     out = {n: (found.value(n)[0] - true[n]) / found.value(n)[1] for n in found.names if n in true}
-    turn = cv2.Rodrigues(found.rig.rotation @ true_rig.rotation.T)[0][:, 0]
+    # `cv2.Rodrigues` takes turns below 1e-5 rad for none.
+    turn = Rotation.from_matrix(found.rig.rotation @ true_rig.rotation.T).as_rotvec()
     out |= {f"rotation.{axis}": turn[i] / found.value(f"rotation.{axis}")[1] for i, axis in enumerate("xyz")}
     out["baseline"] = (found.baseline[0] - np.linalg.norm(true_rig.translation)) / found.baseline[1]
     return {name: float(value) for name, value in out.items()}
@@ -232,3 +237,60 @@ def triangulated(maps: Maps, rig: Rig) -> Maps:
         sigma_point=found.sigma_point,
         epipolar_px=found.epipolar_px,
     )
+
+
+def calibrated(
+    bench: Simulated, settings: SimulatedSettings, rng: np.random.Generator, poses: int = POSES
+) -> Calibration:
+    """Hold the board until it was found in as many poses, as the wizard does, and solve."""
+    found: list[PoseObservation] = []
+    for _ in range(2 * poses):
+        seen = bench.board(held(asked(settings, found), rng))
+        with suppress(BoardNotFoundError):
+            found.append(observed(f"pose {len(found) + 1}", seen))
+        if len(found) == poses:
+            break
+    rig = settings.rig()
+    return calibrate_rig(found, rig.camera.size, rig.projector.size)
+
+
+def accepted(bench: Simulated, found: Rig, settings: SimulatedSettings) -> dict[str, tuple[float, float]]:
+    """Figures (mm) of a plane and a sphere by the rig that was found and by the true one, from the same frames."""
+    out = {}
+    pose = BoardPose(settings.convergence_mm, yaw_deg=12, pitch_deg=-6)
+    for artefact in (PlaneArtefact(width_mm=220, height_mm=160), SphereArtefact(diameter_mm=120)):
+        bench.bench.present(artefact.scene(pose))
+        maps = bench.photograph().maps
+        pair = [
+            evaluate(artefact, [triangulated(maps, rig)], rig, np.random.default_rng(0)).figures
+            for rig in (found, settings.rig())
+        ]
+        for one, other in zip(*pair, strict=True):
+            if one.value_mm is not None and other.value_mm is not None:
+                out[one.quantity.name] = one.value_mm, other.value_mm
+    return out
+
+
+def studied(seed: int, folder: Path, with_artefacts: bool) -> dict[str, object]:
+    """One random rig of the study, from its file where it was done before."""
+    place = folder / f"rig-{seed:03d}.json"
+    if place.is_file():
+        return json.loads(place.read_text())
+    rng = np.random.default_rng([4, seed])
+    settings = random_settings(rng)
+    wall = PlaneScene(width_mm=400, height_mm=300)
+    with Simulated.of(settings.model_copy(update={"scene": wall})) as bench:
+        bench.measure_response()
+        found = calibrated(bench, settings, rng)
+        result = {
+            "seed": seed,
+            "gamma": bench.response.gamma,
+            **figures(found, settings.rig()),
+            "in_sigmas": in_sigmas(found, settings.rig()),
+            "findings": [finding.code for finding in found.findings],
+            "artefacts": accepted(bench, found.rig, settings) if with_artefacts else {},
+        }
+    partial = place.with_suffix(".part")
+    partial.write_text(json.dumps(result))
+    partial.rename(place)
+    return result

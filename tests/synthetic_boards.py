@@ -79,8 +79,13 @@ def seen(
     column_sigma: float = COLUMN_SIGMA,
     axes: str = "xy",
     real_points: np.ndarray | None = None,
+    read_there: bool = False,
 ) -> PoseObservation:
-    """Noisy observation; ``real_points`` is what the board is like when that is not what is believed."""
+    """Noisy observation.
+
+    ``real_points`` is what the board is like when that is not what is believed. With ``read_there`` the projector's
+    coordinates are those of the places where the camera found the points, wrong as these are.
+    """
     points = board_points() if points is None else points
     X = (points if real_points is None else real_points) @ pose.rotation.T + pose.translation
     camera = rig.camera.project(X)
@@ -95,15 +100,32 @@ def seen(
         if letter not in axes:
             measured[:, axis] = np.nan
             sigma[:, axis] = np.nan
+    errors = corner_sigma * rng.standard_normal((n, 2))
+    gradient = across(rig, pose, points[inside]) if read_there else np.zeros((n, 2, 2))
     return PoseObservation(
         name,
         np.flatnonzero(inside),
         points[inside],
-        camera[inside] + corner_sigma * rng.standard_normal((n, 2)),
+        camera[inside] + errors,
         np.full(n, corner_sigma),
-        measured,
+        measured + np.einsum("nij,nj->ni", gradient, errors),
         sigma,
+        gradient,
     )
+
+
+def across(rig: Rig, pose: Held, points: np.ndarray, step_mm: float = 0.01) -> np.ndarray:
+    """(n, 2, 2) derivatives of the projector's picture of a board after the camera's, by central differences."""
+    sides = []
+    for step in (np.array([step_mm, 0, 0]), np.array([0, step_mm, 0])):
+        X = [(points + sign * step) @ pose.rotation.T + pose.translation for sign in (1, -1)]
+        camera, projector = (
+            (rig.camera.project(x) for x in X),
+            (rig.projector.project(rig.to_projector_frame(x)) for x in X),
+        )
+        sides.append([np.subtract(*camera), np.subtract(*projector)])
+    by_camera, by_projector = np.moveaxis(np.array(sides), 0, -1)
+    return by_projector @ np.linalg.inv(by_camera)
 
 
 def seen_all(rig: Rig, poses: list[Held], rng: np.random.Generator, **how) -> list[PoseObservation]:

@@ -15,7 +15,7 @@ from scanner.preview.measures import Reading
 
 Array = NDArray[np.float64]
 
-Step = Literal["focus", "exposure", "response", "latency", "geometry", "acceptance"]
+Step = Literal["focus", "exposure", "latency", "response", "geometry", "acceptance"]
 STEPS: tuple[Step, ...] = get_args(Step)
 
 Nearness = Literal["unseen", "far", "near", "there"]

@@ -85,7 +85,7 @@ def _tiles(sheet: Sheet, guidance: Guidance, points: int) -> list[_Tile]:
         zone = guidance.zone
 
         def magnifier(box: Box) -> None:
-            draw_magnified(sheet.part(box), guidance.frame, fmt, zone)
+            draw_magnified(sheet.part(box), guidance.frame, fmt, zone, coloured=False)
 
         found.append(_Tile("magnified", 4 / 3, 0, magnifier))
     if guidance.curve is not None:

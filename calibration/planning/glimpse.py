@@ -25,7 +25,10 @@ def guessed_lens(points_board: Array, xy: Array, distance_mm: float, size: tuple
     size
         (width, height) of the picture, px.
     """
-    focal = float(np.max(np.ptp(xy, axis=0) / np.ptp(points_board[:, :2], axis=0))) * distance_mm
+    flat, seen = (p - p.mean(axis=0) for p in (points_board[:, :2], xy))
+    # The largest stretch of the affine map: that of the direction which no tilt foreshortens.
+    stretch = np.linalg.svd(np.linalg.lstsq(flat, seen, rcond=None)[0], compute_uv=False)[0]
+    focal = float(stretch) * distance_mm
     width, height = size
     return Lens(np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]), np.zeros(0), size)
 

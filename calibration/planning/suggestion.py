@@ -25,7 +25,10 @@ _DISTANCES = (0.85, 1.0, 1.18)  # of the working distance
 _ROLL = 15.0  # °; edges along the pixels' rows meet every pixel alike, and the same error of sampling in all of them
 _PLACES = (-1, 0, 1)
 _MOST_POINTS = 36  # stand for the whole board: information depends on where it is, not on how finely it is divided
-_FOCAL, _CENTRE_PX, _BASELINE = 3e-4, 1.0, 2e-4  # what a good calibration reaches: weighs px against mm
+
+GOOD_FOCAL, GOOD_CENTRE_PX, GOOD_BASELINE = 3e-4, 1.0, 2e-4
+"""Standard uncertainties that a good calibration reaches, the first and the last relative: weigh px against mm."""
+
 _MARGIN = 0.03  # of the picture: nobody holds a board to the pixel
 _FILL = 0.55
 
@@ -204,11 +207,11 @@ def _tolerances(calibration: Calibration) -> Array:
     baseline, _ = calibration.baseline
     for i, name in enumerate(calibration.names):
         if name.endswith((".fx", ".fy")):
-            out[i] = (_FOCAL * calibration.values[i]) ** -2.0
+            out[i] = (GOOD_FOCAL * calibration.values[i]) ** -2.0
         elif name.endswith((".cx", ".cy")):
-            out[i] = _CENTRE_PX**-2.0
+            out[i] = GOOD_CENTRE_PX**-2.0
         elif name.startswith("translation"):
-            out[i] = (_BASELINE * baseline) ** -2.0
+            out[i] = (GOOD_BASELINE * baseline) ** -2.0
     return out
 
 

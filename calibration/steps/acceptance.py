@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,25 +12,29 @@ import numpy as np
 
 from calibration.acceptance.artefacts import PlaneBesideMirror, SphereBesideMirror
 from calibration.acceptance.evaluation import Evaluation, evaluate
-from calibration.acceptance.figures import Verdict
+from calibration.acceptance.figures import Figure, Verdict
 from calibration.acceptance.interreflection import evaluate_beside_mirror
 from calibration.certificate import Certificate
 from calibration.folder import CERTIFICATE, CERTIFICATE_DATA
-from calibration.operators import Answer
+from calibration.guide.guidance import Bar, Step
+from calibration.operators import Answer, stopped, whereabouts
 from calibration.settings import PlacedArtefact
-from calibration.work import StoppedError, Work
+from calibration.work import Work
+from drivers import Bench
 from scanner.folder import read_result
 from scanner.result import Maps, ScanResult
 from scanner.rig import Rig
 from scanner.session import run_scan
 
-STEP = "acceptance"
+STEP: Step = "acceptance"
+
+_PLACED = "placed.json"
 
 
 def run(work: Work, rig_path: Path) -> Verdict:
     """Scan every artefact of the bench file with the rig at ``rig_path`` and write the certificate.
 
-    A scan that is there already is not made again, unless it was made with another rig.
+    A scan that is there already is not made again where rig, scene, bench and method are the same.
 
     Raises
     ------
@@ -69,22 +75,37 @@ def run(work: Work, rig_path: Path) -> Verdict:
         + ("" if f.limit_mm is None else f", limit {f.limit_mm:g} mm: {f.verdict}")
         for f in certificate.figures
     ]
-    work.report(STEP, {"verdict": str(verdict)}, [], [*figures, f"{verdict}; the certificate is {page}"])
+    conclusion = f"{verdict}; the certificate is {page}"
+    bars = tuple(_bar(figure) for figure in certificate.figures)
+    work.report(STEP, {"verdict": str(verdict)}, [], [*figures, conclusion], bars=bars, large=conclusion)
     return verdict
+
+
+def _bar(figure: Figure) -> Bar:
+    label = f"{figure.artefact}, {figure.quantity.label}"
+    if figure.value_mm is None:
+        return Bar(label, math.nan, figure.verdict is not Verdict.MISSING, "not measured")
+    text = f"{figure.value_mm:.4f} ± {figure.expanded_mm:.4f} mm"
+    if figure.limit_mm is None:
+        return Bar(label, math.nan, True, text)
+    share = figure.limit_mm / max(abs(figure.value_mm), 1e-9)
+    return Bar(label, share, figure.verdict is Verdict.PASS, f"{text}, limit {figure.limit_mm:g}")
 
 
 def _scans(work: Work, title: str, placed: PlacedArtefact, rig: Rig, rig_path: Path) -> list[ScanResult]:
     artefact, pose = placed.artefact, placed.pose
+    where = f"Place it ({artefact.title}) {whereabouts(pose)}. Nothing may move until the scan is done."
     if isinstance(artefact, PlaneBesideMirror | SphereBesideMirror):
         scenes = {
-            f"{title}-mirror": (artefact.title, artefact.scene(pose)),
+            f"{title}-mirror": (where, artefact.scene(pose)),
             f"{title}-removed": (
-                f"{artefact.title}: take the mirror away and touch nothing else",
+                f"Take the mirror away ({artefact.title}), and touch nothing else.",
                 artefact.scene(pose, with_mirror=False),
             ),
         }
     else:
-        scenes = {f"{title}-{i + 1}": (artefact.title, artefact.scene(pose)) for i in range(placed.repeats)}
+        stays = f"Leave it ({artefact.title}) where it stands: it is scanned once more."
+        scenes = {f"{title}-{i + 1}": (stays if i else where, artefact.scene(pose)) for i in range(placed.repeats)}
     return [
         _scan(work, name, what, scene, rig, rig_path, repeat)
         for repeat, (name, (what, scene)) in enumerate(scenes.items())
@@ -95,19 +116,28 @@ def _scan(
     work: Work, name: str, what: str, scene: Mapping[str, Any], rig: Rig, rig_path: Path, repeat: int
 ) -> ScanResult:
     out = work.folder.path / "acceptance" / name
-    if (out / "result.json").is_file() and Rig.load(out / "rig.json").to_json() == rig.to_json():
-        work.terminal.say([f"  {name} is there already"])
-        return read_result(out)
-
-    def ready(bench: Any) -> None:
-        if work.operator.place(bench, what, scene) is Answer.STOP:
-            raise StoppedError("stopped by the operator", "The same command goes on from here.")
-
     changes: dict[str, Any] = {"rig": str(rig_path.resolve())}
     if repeat and hasattr(work.loaded.bench_settings, "seed"):
         # A simulated bench that is opened again has the same noise again, unless it is told otherwise.
         changes["bench__seed"] = work.loaded.bench_settings.seed + repeat
-    result, _ = run_scan(work.configured(**changes), out, out.exists(), work.terminal, ready)
+    loaded = work.configured(**changes)
+    config = loaded.config.model_dump(mode="json")
+    placed = json.loads(
+        json.dumps({"scene": dict(scene), "rig": rig.to_json(), "bench": config["bench"], "scan": config["scan"]})
+    )
+    if (out / _PLACED).is_file() and json.loads((out / _PLACED).read_bytes()) == placed:
+        work.terminal.say([f"  {name} is there already"])
+        return read_result(out)
+
+    def ready(bench: Bench) -> None:
+        if work.operator.place(bench, what, scene) is Answer.STOP:
+            raise stopped()
+
+    with work.listening(name) as listener:
+        result, _ = run_scan(loaded, work.folder.new_scan(name), False, listener, ready)
+    # Written last: a scan without it is made again.
+    (out / _PLACED).write_text(json.dumps(placed), encoding="utf-8")
+    work.operator.tell(True, "scanned")
     return result
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.capture import recorded
-from calibration.exposure import search_exposure
-from calibration.guide.guidance import Step
+from calibration.exposure import MAX_SHOTS, Shot, search_exposure
+from calibration.guide.guidance import Curve, Step
 from calibration.work import StepFailedError, Work
 from drivers import Pixels
 
@@ -36,12 +36,20 @@ def run(work: Work) -> None:
         saturated_dn = bench.frame_format.saturated_dn
         projector = getattr(bench, "projector", None)
         period = getattr(projector, "refresh_s", getattr(projector, "period_s", None))
-        work.hold_facing(bench, STEP, "Hold the board where it is brightest: as near as it will come.", nearest=True)
+        work.hold_facing(
+            bench,
+            STEP,
+            "how long may the camera look?",
+            f"Hold the board where it is brightest, {work.settings.geometry.nearest_mm / 10:.0f} cm from the camera, "
+            "and still until the exposure is found.",
+            nearest=True,
+        )
     taken = 0
 
     def photograph(exposure_us: float) -> Pixels:
         nonlocal taken
         taken += 1
+        work.operator.wait(f"exposure: {exposure_us:.0f} µs", taken, MAX_SHOTS)
         with work.bench(still=True, bench__camera__exposure_us=exposure_us) as bench:
             work.operator.keep(bench)
             width, height = bench.projector_size
@@ -80,4 +88,18 @@ def run(work: Work) -> None:
         },
         found.findings,
         [found.reason],
+        _curve(found.shots),
+    )
+
+
+def _curve(shots: tuple[Shot, ...]) -> Curve | None:
+    """Brightness against exposure; one point is no curve."""
+    if len(shots) < 2:
+        return None
+    return Curve(
+        "brightest pixels",
+        np.array([shot.exposure_us / 1e3 for shot in shots]),
+        np.array([100 * shot.brightest for shot in shots]),
+        "exposure, ms",
+        "% of full scale",
     )

@@ -19,7 +19,10 @@ def run(work: Work) -> None:
     """
     with work.bench(still=True) as bench:
         work.hold_facing(
-            bench, STEP, "Hold the board in the middle; turn the camera's focus ring until the picture is sharpest."
+            bench,
+            STEP,
+            "is the camera in focus?",
+            "Hold the board in the middle of the volume; turn the camera's focus ring until its edges are sharpest.",
         )
         width, height = bench.projector_size
         frame = np.empty(bench.frame_format.shape, bench.frame_format.dtype)

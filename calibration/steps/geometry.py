@@ -16,13 +16,14 @@ from calibration.diagnosis import Expectation, Fringes
 from calibration.export import export_opencv
 from calibration.folder import OPENCV_RIG, RIG
 from calibration.guide.guidance import Step
+from calibration.knowledge import known
 from calibration.observations import BoardPose, PoseObservation
-from calibration.operators import Answer, Request
+from calibration.operators import Answer, Request, stopped, wording
 from calibration.planning import first_poses, grid, next_pose
 from calibration.planning.glimpse import guessed_lens
 from calibration.solver.refusal import CalibrationError
 from calibration.solver.result import Calibration
-from calibration.work import StepFailedError, StoppedError, Work
+from calibration.work import StepFailedError, Work
 from drivers import Bench
 from scanner.acquisition import AcquisitionError, ExposureError
 from scanner.config import ScanSection
@@ -52,28 +53,53 @@ def run(work: Work) -> None:
         No board was found again and again, or the rig is refused, with the reasons.
     """
     wanted = work.settings.geometry.poses
+    while True:
+        poses, camera_size, projector_size = _collected(work, wanted)
+        try:
+            _finish(work, poses, camera_size, projector_size)
+        except StepFailedError as error:
+            if not work.operator.again(STEP, error, "take another pose"):
+                raise StepFailedError(
+                    error.message,
+                    f"{error.remedy}\nMore poses: --set calibration.geometry.poses={len(poses) + 2}; all of them anew: "
+                    "--step geometry.",
+                ) from error
+            wanted = len(poses) + 1
+        else:
+            return
+
+
+def _collected(work: Work, wanted: int) -> tuple[list[PoseObservation], tuple[int, int], tuple[int, int]]:
+    """All poses, with those that were missing, and the sizes of both pictures."""
     misses = 0
+    skipped: list[BoardPose] = []
+    solved_for, calibration = -1, None
     with work.bench() as bench:
-        camera_size, projector_size = _sizes(bench)
+        sizes = _sizes(bench)
         while len(poses := work.folder.poses()) < wanted:
-            calibration = _solved(work, poses, camera_size, projector_size)
-            request = _request(work, poses, calibration, camera_size)
+            if len(poses) != solved_for:
+                solved_for, calibration = len(poses), _solved(poses, *sizes)
+            request = _request(work, poses, wanted, calibration, sizes[0], skipped)
             answer = work.operator.hold_board(bench, work.board, request)
             if answer is Answer.STOP:
-                raise StoppedError(
-                    f"stopped by the operator with {len(poses)} of {wanted} poses",
-                    "The same command goes on from here.",
-                )
-            if answer is Answer.BACK and poses:
+                raise stopped(f"stopped by the operator with {len(poses)} of {wanted} poses")
+            if answer is Answer.SKIP:
+                skipped.append(request.pose)
+            elif answer is Answer.BACK and poses:
                 work.folder.drop_pose(poses[-1].name)
+                work.terminal.say([f"{poses[-1].name} is left out"])
+                work.operator.tell(True, f"{poses[-1].name} is left out")
             elif answer is Answer.TAKE:
-                misses = 0 if _take(work, bench, request) else misses + 1
+                taken = _take(work, bench, request)
+                misses = 0 if taken else misses + 1
+                if taken:
+                    skipped.clear()
             if misses > wanted:
                 raise StepFailedError(
-                    f"geometry: the board was not seen in {misses} poses in turn",
-                    "Look at the takes of these poses: is the whole board lit and in the picture?",
+                    f"geometry: {misses} poses in turn did not count",
+                    "Look at the takes of these poses: is the whole board lit, still, and in the picture?",
                 )
-    _finish(work, poses, camera_size, projector_size)
+    return poses, *sizes
 
 
 def fringes(work: Work, projector_size: tuple[int, int]) -> ScanSection:
@@ -100,9 +126,10 @@ def take_pose(work: Work, bench: Bench, name: str, **notes: object) -> PoseObser
         The board is not seen, it moved, or it is too bright there.
     """
     scan = fringes(work, bench.projector_size)
-    maps, noise = capture_fringes(
-        bench, scan, work.response, work.folder.new_take(name), work.occasion(STEP, **notes), work.terminal
-    )
+    with work.listening(name) as listener:
+        maps, noise = capture_fringes(
+            bench, scan, work.response, work.folder.new_take(name), work.occasion(STEP, **notes), listener
+        )
     # The mean of all fringes is a picture in steady light, with the noise of one over the root of their number.
     level = float(np.quantile(maps.brightness, 0.9))
     frames = scan.steps * sum(len(scan.frequencies(axis) or ()) for axis in scan.axes)
@@ -116,10 +143,12 @@ def _take(work: Work, bench: Bench, request: Request) -> bool:
         observation = take_pose(work, bench, name, asked=vars(request.pose))
     except (BoardNotFoundError, AcquisitionError, ExposureError) as error:
         work.terminal.note(f"{name} does not count: {error.message}. {error.remedy}")
+        work.operator.tell(False, f"does not count: {error.message}")
         return False
     work.folder.add_pose(name, observation)
     seen = np.isfinite(observation.projector).any(axis=1).sum()
     work.terminal.say([f"{name}: {len(observation.ids)} points, {seen} of them in the projector's picture as well"])
+    work.operator.tell(True, f"taken: {len(observation.ids)} points")
     return True
 
 
@@ -129,27 +158,31 @@ def _sizes(bench: Bench) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def _request(
-    work: Work, poses: list[PoseObservation], calibration: Calibration | None, camera_size: tuple[int, int]
+    work: Work,
+    poses: list[PoseObservation],
+    wanted: int,
+    calibration: Calibration | None,
+    camera_size: tuple[int, int],
+    skipped: list[BoardPose],
 ) -> Request:
+    """The next pose, other than those that the operator would not hold."""
     settings = work.settings.geometry
     middle = (settings.nearest_mm + settings.farthest_mm) / 2
-    title = f"pose {len(poses) + 1} of {settings.poses}"
-    if not poses:
-        return Request(
-            STEP, title, "in the middle of the picture, facing the camera", BoardPose(middle, roll_deg=_ROLL)
-        )
+    facing = BoardPose(middle, roll_deg=_ROLL)
+    bars, lens = ((), None) if calibration is None else (known(calibration), calibration.rig.camera)
+    pose, reason = facing, ""
     if calibration is None or len(poses) < _BEGINNING:
-        lens = guessed_lens(poses[0].points_board, poses[0].camera, middle, camera_size)
-        scheme = first_poses(lens, work.board.points)
-        pose = scheme[len(poses) % len(scheme)]
-        return Request(STEP, title, "another tilt", _within(work, pose))
-    pool = [_within(work, p) for p in grid(calibration.rig.camera, work.board.points, middle)]
-    found = next_pose(calibration, work.board.points, pool)
-    if found is None:
-        return Request(
-            STEP, title, "in the middle of the picture, facing the camera", BoardPose(middle, roll_deg=_ROLL)
-        )
-    return Request(STEP, title, f"{found.reason}", found.pose, f"lowers the uncertainty by {100 * found.gain:.0f} %")
+        if poses:
+            guess = guessed_lens(poses[0].points_board, poses[0].camera, middle, camera_size)
+            scheme = [_within(work, p) for p in first_poses(guess, work.board.points)]
+            left = [p for p in scheme[len(poses) :] + scheme if p not in skipped]
+            pose = left[0] if left else facing
+    else:
+        pool = [_within(work, p) for p in grid(calibration.rig.camera, work.board.points, middle)]
+        found = next_pose(calibration, work.board.points, [p for p in pool if p not in skipped])
+        if found is not None:
+            pose, reason = found.pose, f"lowers the uncertainty by {100 * found.gain:.0f} %"
+    return Request(STEP, f"pose {len(poses) + 1} of {wanted}", wording(pose), pose, True, reason, bars, lens)
 
 
 def _within(work: Work, pose: BoardPose) -> BoardPose:
@@ -170,7 +203,7 @@ def _within(work: Work, pose: BoardPose) -> BoardPose:
 
 
 def _solved(
-    work: Work, poses: list[PoseObservation], camera_size: tuple[int, int], projector_size: tuple[int, int]
+    poses: list[PoseObservation], camera_size: tuple[int, int], projector_size: tuple[int, int]
 ) -> Calibration | None:
     """The calibration of the poses so far; None where they do not make one yet."""
     if len(poses) < _BEGINNING:
@@ -186,12 +219,15 @@ def _finish(
 ) -> None:
     settings = work.settings
     steps = settings.geometry.steps
+    work.terminal.say([f"geometry: computing the rig from {len(poses)} poses"])
+    work.operator.wait(f"computing the rig from {len(poses)} poses", 0, 0)
     try:
         found = calibrate_rig(
             poses,
             camera_size,
             projector_size,
             bend=settings.geometry.bend,
+            board_sigma_mm=settings.geometry.board_sigma_mm,
             expected=Expectation(baseline_mm=settings.expected.baseline_mm, tolerance=settings.expected.tolerance),
             fringes=Fringes(1 / _PERIODS[0], 1 / _PERIODS[0], steps),
             validity={
@@ -226,7 +262,8 @@ def _finish(
         rig.save(work.folder.path / RIG)
         export_opencv(rig, work.folder.path / OPENCV_RIG)
         lines.append(f"the rig is {work.folder.path / RIG}; name it in the bench file as `rig:`")
-    work.report(STEP, {"rms_px": {"camera": found.rms_camera, "projector": found.rms_projector}}, found.findings, lines)
+    rms = {"camera": found.rms_camera, "projector": found.rms_projector}
+    work.report(STEP, {"rms_px": rms}, found.findings, lines, bars=known(found), large=" · ".join(lines[:2]))
 
 
 def _line(found: Calibration, lens: str) -> str:

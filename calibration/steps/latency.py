@@ -6,7 +6,7 @@ import numpy as np
 
 from calibration.capture import recorded
 from calibration.display import check_display
-from calibration.guide.guidance import Step
+from calibration.guide.guidance import Curve, Step
 from calibration.work import Work
 from drivers import LatencyBound
 
@@ -24,9 +24,14 @@ def run(work: Work) -> None:
     document = None
     lines = []
     with work.bench(still=True) as bench:
-        work.hold_facing(bench, STEP, "Hold the board still in the middle of the volume; the light will flash.")
+        work.hold_facing(
+            bench,
+            STEP,
+            "how late is a picture?",
+            "Hold the board still in the middle of the volume; the light will flash.",
+        )
         if isinstance(bench, LatencyBound):
-            with work.terminal.counting("latency: step") as count:
+            with work.counting("latency: step") as count:
                 latency = bench.measure_latency(count)
             document = latency.to_json()
             lines.append(
@@ -38,7 +43,7 @@ def run(work: Work) -> None:
             lines.append(f"{bench.name} knows by itself when a picture is on the surface")
         period = getattr(getattr(bench, "projector", None), "period_s", None)
         place, occasion = work.folder.new_take(STEP), work.occasion(STEP)
-        with recorded(bench, place, occasion, 64) as recording, work.terminal.counting("display: picture") as count:
+        with recorded(bench, place, occasion, 64) as recording, work.counting("display: picture") as count:
             check = check_display(recording, progress=count)
     frames_late = None if document is None or not period else float(np.ceil(document["median_s"] / period))
     if frames_late is not None:
@@ -49,4 +54,12 @@ def run(work: Work) -> None:
         {"latency": document, "refreshes": frames_late, "pictures_checked": len(check.shown)},
         check.findings,
         [line for line in lines if line],
+        Curve(
+            "picture that was seen",
+            check.shown.astype(np.float64),
+            check.seen.astype(np.float64),
+            "picture that was asked for",
+            "number read in its exposure",
+            fitted=check.shown.astype(np.float64),
+        ),
     )

@@ -6,7 +6,7 @@ import numpy as np
 
 from calibration.capture import photographed, recorded
 from calibration.focus import projector_focus
-from calibration.guide.guidance import Step
+from calibration.guide.guidance import Curve, Step
 from calibration.photometry import (
     Harmonics,
     Ramp,
@@ -41,7 +41,12 @@ def run(work: Work) -> None:
         The light is not steady or does not rise with the grey level, or the fringes are far out of focus.
     """
     with work.bench() as bench:
-        work.hold_facing(bench, STEP, "Hold the board's back, or white paper, in the middle of the volume, and still.")
+        work.hold_facing(
+            bench,
+            STEP,
+            "light against grey level",
+            "Hold the board's back, or white paper, in the middle of the volume, and still.",
+        )
         measured = response_of_ramp(_ramp(work, bench))
         response = measured.response
         uncorrected, corrected = (
@@ -54,7 +59,7 @@ def run(work: Work) -> None:
         occasion = work.occasion(STEP, plan=plan.to_json())
         with (
             recorded(bench, place, occasion, plan.frame_count) as recording,
-            work.terminal.counting("frequency") as count,
+            work.counting("response: frequency") as count,
         ):
             for number, frames in photographed(recording, plan):
                 phasors.add(number, frames)
@@ -76,12 +81,20 @@ def run(work: Work) -> None:
         },
         [*measured.findings, *([] if focus.finding is None else [focus.finding])],
         [
-            f"γ = {response.gamma:.3f} ± {response.gamma_sigma:.3f} by the ramp, "
-            f"{second.gamma:.3f} ± {second.sigma:.3f} by the second harmonic",
+            f"γ = {response.gamma:.3f} ± {response.gamma_sigma:.2g} by the ramp, "
+            f"{second.gamma:.3f} ± {second.sigma:.2g} by the second harmonic",
             f"second harmonic of a fringe: {100 * uncorrected.ratio[1]:.2f} % uncorrected, "
             f"{100 * corrected.ratio[1]:.2f} % corrected",
             f"fringes of {1 / _FINEST:.0f} px keep {100 * focus.value:.0f} % of their contrast",
         ],
+        Curve(
+            "response of the projector",
+            measured.levels.astype(np.float64),
+            100 * measured.light,
+            "grey level",
+            "light, % of white",
+            fitted=100 * np.asarray(response.light)[measured.levels],
+        ),
     )
 
 
@@ -91,7 +104,7 @@ def _ramp(work: Work, bench: Bench) -> Ramp:
     occasion = work.occasion(STEP)
     with (
         recorded(bench, place, occasion, len(levels) + 6) as recording,
-        work.terminal.counting("ramp: picture") as count,
+        work.counting("response: picture") as count,
     ):
         return take_ramp(recording, levels, count)
 

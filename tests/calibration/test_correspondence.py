@@ -79,14 +79,29 @@ def test_errors_are_what_sigma_says(kind):
     assert 0.75 < np.sqrt(np.mean((errors / sigma) ** 2)) < (2.0 if kind == "charuco" else 1.4)
 
 
-def test_uncertainty_of_the_corner_is_carried_over():
+def test_an_error_of_the_corner_is_told_from_the_coordinate_s_own():
     board, rng = BOARDS["chessboard"], np.random.default_rng(2)
     truth = projected(board.points)[:, 0]
     x_p, sigma, modulation = decoded("chessboard", rng)
     xy = SEEN.project(board.points) + rng.normal(0, 0.05, (len(board.points), 2))
     seen = observe("pose", view_of(board, 0.05, xy), board, x_p, sigma, None, None, modulation)
-    normalised = (seen.projector[:, 0] - truth) / seen.projector_sigma[:, 0]
-    assert 0.75 < np.sqrt(np.mean(normalised**2)) < 1.25  # 56 values: ± 10 %
+    moved = np.einsum("nj,nj->n", seen.projector_gradient[:, 0], xy - SEEN.project(board.points))
+    assert moved.std() > 10 * np.median(seen.projector_sigma[:, 0])
+    normalised = (seen.projector[:, 0] - truth - moved) / seen.projector_sigma[:, 0]
+    assert 0.75 < np.sqrt(np.mean(normalised**2)) < 1.4  # 56 values: ± 10 %
+
+
+def test_points_do_not_share_their_errors():
+    """The mean over the board errs as that of independent points does; shared pixels would double it."""
+    board, rng = BOARDS["chessboard"], np.random.default_rng(7)
+    truth = projected(board.points)[:, 0]
+    means, expected = [], []
+    for _ in range(12):
+        x_p, sigma, modulation = decoded("chessboard", rng)
+        seen = observe("pose", view_of(board), board, x_p, sigma, None, None, modulation)
+        means.append(np.mean(seen.projector[:, 0] - truth))
+        expected.append(np.sqrt(np.sum(seen.projector_sigma[:, 0] ** 2)) / len(truth))
+    assert 0.5 < np.std(means, ddof=1) / np.mean(expected) < 1.6  # 12 values: ± 21 %
 
 
 def test_both_axes_and_names():

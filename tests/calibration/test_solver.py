@@ -88,10 +88,40 @@ def test_true_values_lie_in_the_intervals(random_rigs):
     assert 0.5 < np.sqrt(np.mean(np.square(focal))) < 1.5
 
 
-def test_derivatives_are_those_of_finite_differences():
+def test_coordinates_read_at_the_camera_s_points():
+    """Their common error is no error of the rig: uncertainties are smaller than with errors apart, and true."""
+    rng = np.random.default_rng(21)
+    rig = random_rig(rng)
+    poses = good_poses(rng, 6)
+    noise = {"corner_sigma": 0.05, "column_sigma": 0.01}
+    start = calibrate_rig(seen_all(rig, poses, rng, read_there=True, **noise), CAMERA_SIZE, PROJECTOR_SIZE, terms=ALL)
+    assert start.rms_projector == pytest.approx(start.expected_projector, rel=0.1)
+    assert start.rms_projector > 4 * np.sqrt(2) * noise["column_sigma"]
+    assert start.scale_projector == pytest.approx(1, abs=0.1)
+    total = np.hypot(noise["column_sigma"], 1.3 * noise["corner_sigma"])
+    apart = calibrate_rig(
+        seen_all(rig, poses, rng, corner_sigma=0.05, column_sigma=total), CAMERA_SIZE, PROJECTOR_SIZE, terms=ALL
+    )
+    free = Model(start.adjusted.state, (True, True), CAMERA_SIZE, PROJECTOR_SIZE).freedom(ALL)
+    fits = [
+        adjusted(
+            start.adjusted.state, gathered(seen_all(rig, poses, rng, read_there=True, **noise)), free, np.ones(2)
+        ).state.values
+        for _ in range(30)
+    ]
+    ratio = np.std(fits, axis=0, ddof=1) @ np.abs(free.spread) / start.standard_uncertainty
+    chosen = [not name.startswith("rotation") for name in start.names]
+    # σ of a standard deviation of 30: 13 %.
+    assert np.all((ratio[chosen] > 0.55) & (ratio[chosen] < 1.5))
+    assert ratio[chosen].mean() == pytest.approx(1, abs=0.15)
+    assert start.value("camera.fx")[1] < 0.85 * apart.value("camera.fx")[1]
+
+
+@pytest.mark.parametrize("read_there", [False, True])
+def test_derivatives_are_those_of_finite_differences(read_there):
     rng = np.random.default_rng(4)
     rig = random_rig(rng)
-    data = gathered(seen_all(rig, good_poses(rng, 3), rng))
+    data = gathered(seen_all(rig, good_poses(rng, 3), rng, read_there=read_there))
     values = np.concatenate(
         [
             *([lens.matrix[0, 0], lens.matrix[1, 1], *lens.matrix[:2, 2], *rng.normal(0, 0.02, 14)]
