@@ -108,7 +108,8 @@ def first_poses(camera: Lens, board_points: Array, rig: Rig | None = None) -> tu
     rig
         A guess of the rig; poses that the projector would not see whole are left out.
     """
-    width, height = np.ptp(board_points[:, :2], axis=0)
+    turned, _ = placed(BoardPose(1.0, roll_deg=_ROLL))
+    width, height = np.ptp(board_points @ turned.T, axis=0)[:2]
     distance = max(
         width * camera.matrix[0, 0] / camera.size[0] / _FILL, height * camera.matrix[1, 1] / camera.size[1] / _FILL
     )

@@ -10,7 +10,7 @@ from calibration.planning import coverage, placed, pose_of
 from calibration.planning.suggestion import first_poses, next_pose, visible
 from calibration.solver.selection import Terms
 from scanner.rig import Lens
-from sim_backend.scenes import Pose
+from sim_backend.scenes import PlaneScene
 
 TERMS = Terms(("k1",), ("k1",))
 
@@ -18,7 +18,7 @@ TERMS = Terms(("k1",), ("k1",))
 def test_poses_are_those_of_the_simulated_bench():
     pose = BoardPose(640, 12, -7, yaw_deg=25, pitch_deg=-18)
     R, t = placed(pose)
-    scene = Pose(distance_mm=640, offset_x_mm=12, offset_y_mm=-7, yaw_deg=25, pitch_deg=-18)
+    scene = PlaneScene(distance_mm=640, offset_x_mm=12, offset_y_mm=-7, yaw_deg=25, pitch_deg=-18)
     for point in ((0, 0, 0), (30, 0, 0), (0, 40, 0), (5, 6, 7)):
         np.testing.assert_allclose(R @ point + t, scene.placed(point), atol=1e-9)
 

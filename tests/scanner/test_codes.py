@@ -73,5 +73,5 @@ def test_light_that_flickers_in_one_of_the_steps(step, ratio, found):
 def test_codes_are_decoded_with_the_steps_of_their_patterns():
     _, frames, x = scene(1, bounce=0)
     assert [f.step_rad for f in PLAN.sequences[0].fringes[3:]] == pytest.approx([0, np.pi, 0, np.pi])
-    found = nearest_code(noisy(frames, 1), PLAN.sequences[0], SIZE[0], NoiseModel(1.5))[0]
+    found = nearest_code(noisy(frames, 1), PLAN.sequences[0], SIZE[0], NoiseModel(1.5)).coordinates
     assert (np.abs(found.u - x) < 5 * found.sigma).mean() > 0.99

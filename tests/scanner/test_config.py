@@ -350,7 +350,7 @@ MISTAKES = {
     "key of another section": (
         BENCH + "▸steps: 12\n",
         "steps",
-        "expected one of: bench, calibration, gates",
+        "expected one of: bench, calibration, compare, gates",
         "move it below `scan:`",
     ),
     "key of a deeper section": (
