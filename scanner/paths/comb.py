@@ -36,6 +36,11 @@ class Comb:
     high: float
     pencil: tuple[Phasors, Reals, Reals]
 
+    @property
+    def start_and_step(self) -> tuple[float, float]:
+        """2πf₀ and 2πΔf, rad/px."""
+        return self.carrier * (1 + float(self.xi[0])), self.carrier * self.step_rad
+
 
 def prepare(
     z: ArrayLike, frequency: ArrayLike, sigma_z: ArrayLike, extent: float, gain: ArrayLike | None
