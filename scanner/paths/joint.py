@@ -44,7 +44,7 @@ REFUSED_ONE_IN = 1e4
 _BLOCK = 1024
 _SURE, _SURE_SIGMAS = 7.0, 4.0
 """A hypothesis of the axis along that is e⁷ times as likely as its rival and fits needs no other seed,"""
-_CLOSE_PX = 80.0
+_CLOSE_PX = 48.0
 """unless its paths lie nearer to each other than this, where the axis along mistakes the fringe orders."""
 _UNKNOWN_LINE_PX, _LEAST_LINE_PX = 0.1, 0.02
 """Error of a calibrated rig where the scan itself does not show it, and the least that is believed, px."""

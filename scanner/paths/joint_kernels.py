@@ -377,11 +377,13 @@ def joint_block(
             ya[t], ga[t] = (1 / gain_a[t]) * za[t, p], (gain_a[t] / sigma_a[p]) ** 2
         for t in range(count_b):
             yb[t], gb[t] = (1 / gain_b[t]) * zb[t, p], (gain_b[t] / sigma_b[p]) ** 2
-        tried = 0
+        tried, least = 0, math.inf
         for k in range(kinds):
             for i in range(2):
                 place = other[2 * k + i, p]
-                if not (low_b - 1 <= place < high_b + 1):
+                # Both axes together cannot fit better than this one alone.
+                hopeless = fits[k, 7, p] > least + _HOPELESS_CHI2
+                if hopeless or not (low_b - 1 <= place < high_b + 1):
                     continue
                 theta = thetas[tried]
                 theta[0], theta[1] = fits[k, i, p], fits[k, 1 - i, p]
@@ -390,12 +392,15 @@ def joint_block(
                 theta[5], rest = _rest(yb, gb, comb, place, theta[6], low_b, high_b, left)
                 theta[7] = max(rest, 0.1 * kappa * theta[3])
                 _set_line(priors[tried], prior, theta[0], place, slopes[2 * k + i, p])
-                tried += 1
+                chi2s[tried], _ = _improve(ya, ga, yb, gb, comb, priors[tried], theta, _FIRST_STEPS, work)
+                if chi2s[tried] < math.inf:
+                    least = min(least, chi2s[tried])
+                    tried += 1
         for k in range(kinds_across):
             for i in range(2):
                 b1, b2 = fits_across[k, 2 + i, p], fits_across[k, 3 - i, p]
                 allowed = _NEAR_LINE_PX + _NEAR_LINE_SIGMAS * (prior[3] + fits_across[k, 4 + i, p])
-                if not (fits_across[k, 8, p] < _HOPELESS_CHI2 and b1 > 0):
+                if not (fits_across[k, 7, p] < least + _HOPELESS_CHI2 and b1 > 0):
                     continue
                 off = math.inf
                 for m in range(other.shape[0]):
@@ -421,13 +426,10 @@ def joint_block(
                     theta[0], theta[1], theta[2], theta[3] = pairs[j, 1], pairs[j, 2], b1 / kappa, pairs[j, 3]
                     theta[4], theta[5], theta[6], theta[7] = fits_across[k, i, p], fits_across[k, 1 - i, p], b1, b2
                     _set_line(priors[tried], prior, theta[0], place, s)
-                    tried += 1
-        least = math.inf
-        for h in range(tried):
-            chi2s[h], _ = _improve(ya, ga, yb, gb, comb, priors[h], thetas[h], _FIRST_STEPS, work)
-            if not chi2s[h] < math.inf:
-                chi2s[h] = math.inf
-            least = min(least, chi2s[h])
+                    chi2s[tried], _ = _improve(ya, ga, yb, gb, comb, priors[tried], theta, _FIRST_STEPS, work)
+                    if chi2s[tried] < math.inf:
+                        least = min(least, chi2s[tried])
+                        tried += 1
         best = -1
         for h in range(tried):
             scores[h] = math.inf
