@@ -13,8 +13,8 @@ from scanner.regions import inside, sound_mask
 
 Rounds = Literal["auto", 1, 2]
 
-UNDECIDED = 0.02
-"""Share of the region's pixels that may stay without a coordinate."""
+UNDECIDED = 0.03
+"""Share of the region's pixels that may stay without a coordinate: two rounds are held to 97 % as well."""
 BLURRED = 0.02
 """Share of them whose σ may be more than `BLUR` times what a second round would reach."""
 BLUR = 2.0

@@ -96,8 +96,9 @@ def choose_direct(
     if y is not None:
         one, two = x.amplitude[:, None], y.amplitude[None]
         noise = np.hypot(x.sigma_amplitude, y.sigma_amplitude)
-        allowed = np.sqrt(noise**2 + (_RATIO * 0.5 * (one + two)) ** 2)
-        ratio = _log_likelihood(one - two, allowed, _RATIO_STRAY, 1 / (x.amplitude[0] + y.amplitude[0]))
+        # Relative, so that the agreement of two weak paths counts no more than that of two strong ones.
+        middle = 0.5 * (one + two)
+        ratio = _log_likelihood((one - two) / middle, np.hypot(noise / middle, _RATIO), _RATIO_STRAY, 0.25)
         score += np.nan_to_num(ratio)
     if distance_px is not None:
         distance = np.asarray(distance_px, np.float64).reshape(shape)

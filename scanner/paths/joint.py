@@ -218,7 +218,7 @@ def separate_jointly(
     across: Axis = "y" if along == "x" else "x"
     a, b = axes[along], axes[across]
     fits = separate_candidates(a.z, a.frequency, a.sigma_z, a.extent, a.gain)
-    places = fits[:, :2].reshape(-1, pixels.size)
+    places = fits[:, :2].reshape(2 * len(fits), pixels.size)
     other, slope = epipolar_crossings(rig, pixels, places, along)
     log_ratio = coupling.log_ratio if along == "x" else -coupling.log_ratio
     prior = np.array([0, 0, 0, coupling.line_px, log_ratio, coupling.ratio, _BOUNCE_RATIO])

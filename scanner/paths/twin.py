@@ -79,3 +79,48 @@ def separate_two_paths_twin(
     sigma = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
     column = [p[1], p[3], p[0], p[2], sigma[1], sigma[3], sigma[0], chi2, next(others, math.inf)]
     return two_paths(np.array(column, np.float32)[:, None], f.size)
+
+
+def refine_jointly_twin(
+    z: tuple[Phasors, Phasors],
+    frequency: tuple[Reals, Reals],
+    sigma_z: tuple[float, float],
+    start: ArrayLike,
+    line: tuple[float, float, float, float],
+    log_ratio: tuple[float, float, float],
+) -> tuple[Reals, Reals, float]:
+    """Plain twin of the refinement in `scanner.paths.separate_jointly`, for one pixel and one hypothesis.
+
+    Parameters
+    ----------
+    z, frequency, sigma_z
+        Phasors (T,), f_t and noise of the axis along the epipolar line and of that across it.
+    start
+        (8,) u₁, u₂, a₁, a₂ along, the same across; path 1 is direct.
+    line
+        Place along, place across, slope, and σ across, of the epipolar line.
+    log_ratio
+        ln κ, and σ of the log ratio of the direct path and of the bounce.
+
+    Returns
+    -------
+    parameters, sigma, chi2
+        (8,), (8,) from the inverse Fisher matrix, and the sum of squares.
+    """
+
+    def misfit(p: Reals) -> Reals:
+        off = [
+            (z[k] - np.exp(2j * np.pi * np.outer(frequency[k], q[:2])) @ q[2:]) / sigma_z[k]
+            for k, q in enumerate((p[:4], p[4:]))
+        ]
+        priors = [
+            (p[4] - line[1] - line[2] * (p[0] - line[0])) / line[3],
+            *((np.log(p[6 + k] / p[2 + k]) - log_ratio[0]) / log_ratio[1 + k] for k in range(2)),
+        ]
+        return np.concatenate([*(part for o in off for part in (o.real, o.imag)), priors])
+
+    first = np.asarray(start, np.float64)
+    scale = np.tile([0.1, 0.1, 1.0, 1.0], 2)
+    fit = least_squares(misfit, first, x_scale=scale, ftol=1e-12, xtol=1e-12)
+    jacobian = np.asarray(fit.jac, np.float64)
+    return fit.x, np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))), float(2 * fit.cost)
