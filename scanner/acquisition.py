@@ -187,6 +187,9 @@ class Acquisition:
                 self._enter(ScanState.DECODING, "decoding round 1")
                 with self._timed("decode round 1"):
                     second_plan = self.decoder.first(first)
+                if self.decoder.decision:
+                    self.listener.note(self.decoder.decision)
+                    self.take.note(self.decoder.decision)
                 if second_plan is not None:
                     found = self.decoder.maps
                     self._history.begin_round(
@@ -208,6 +211,11 @@ class Acquisition:
         except BaseException:
             self._enter(ScanState.FAILED, "failed")
             raise
+
+    @property
+    def _rounds(self) -> int:
+        """Rounds at most."""
+        return self.scan.rounds_at_most(self.method.rounds)
 
     @contextmanager
     def _dark_afterwards(self) -> Iterator[None]:
@@ -283,7 +291,7 @@ class Acquisition:
         """Photograph all sequences of a round; returns what the method collected of them."""
         self.take.begin_round(number, plan.to_json())
         collected = self.method.collect(plan, self.bench.frame_format)
-        self._enter(ScanState.CAPTURING, f"round {number} of {self.method.rounds}")
+        self._enter(ScanState.CAPTURING, f"round {number} of {self._rounds}")
         fmt = self.bench.frame_format
         longest = max(len(s) for s in plan.sequences)
         # Two buffers take turns: one is being filled while the other is checked and demodulated.
@@ -345,7 +353,7 @@ class Acquisition:
             self.listener.frame(
                 Progress(
                     round=number,
-                    rounds=self.method.rounds,
+                    rounds=self._rounds,
                     sequence=sequence + 1,
                     sequences=len(plan.sequences),
                     label=fringes.label,
@@ -431,7 +439,7 @@ class Acquisition:
         self.repeats += len(fringes)
         self._enter(ScanState.REPEATING, f"{fringes.label}, attempt {attempt + 1}")
         self._note(f"round {number}, {fringes.label}: {reason}; the sequence was taken again")
-        self._enter(ScanState.CAPTURING, f"round {number} of {self.method.rounds}")
+        self._enter(ScanState.CAPTURING, f"round {number} of {self._rounds}")
         return [(sequence, attempt + 1)]
 
 

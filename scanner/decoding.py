@@ -36,6 +36,7 @@ class Decoder:
     noise: NoiseModel | None
     rig: Rig | None
     warnings: list[str] = field(default_factory=list, init=False)
+    decision: str = field(default="", init=False)
     used_noise: NoiseModel | None = field(default=None, init=False)
     _setup: Setup | None = field(default=None, init=False)
     _first: FirstRound | None = field(default=None, init=False)
@@ -48,6 +49,7 @@ class Decoder:
         self._first = self.method.decode(frames, self._setup)
         self._maps = self._first.maps
         self.warnings += self._first.notes
+        self.decision = self._first.decision
         return self.method.second_round(self._first, self._setup)
 
     def second(self, frames: RoundFrames) -> None:

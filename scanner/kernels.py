@@ -415,6 +415,7 @@ def compile_all() -> float:
 
     few = np.ones((9, 4), np.complex64)
     paths.separate_two_paths(few, np.array([(80 + t) / 1280 for t in range(9)]), np.ones(4, np.float32), 1280)
+    paths.compile_all()
     triangulation.compile_all()
     cloud.grid_normals(np.ones((1, 1, 3), np.float32), np.ones((1, 1), np.float32))
     steps = 2 * np.pi * np.arange(4) / 4

@@ -251,6 +251,57 @@ def triangulate_row(
             epipolar_sigmas[i] = distance / distance_sigma
 
 
+@_compiled
+def epipolar_crossings(
+    directions: Any,
+    projector: Any,
+    rotation: Any,
+    translation: Any,
+    axis: int,
+    u: Any,
+    other: Any,
+    slope: Any,
+    begin: int,
+    end: int,
+) -> None:
+    """Where the epipolar curves of the camera rays begin..end cross given projector columns (``axis`` 0) or rows (1).
+
+    ``directions`` (n, 3) are the camera's rays, ``u`` (k, n) the coordinates; ``other`` and ``slope`` (k, n) are filled
+    with the other coordinate there and its change with ``u``, NaN where no point before camera and projector is there.
+    """
+    t0, t1, t2 = translation[0], translation[1], translation[2]
+    for i in range(begin, end):
+        dx, dy = directions[i, 0], directions[i, 1]
+        a0 = rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2]
+        a1 = rotation[1, 0] * dx + rotation[1, 1] * dy + rotation[1, 2]
+        a2 = rotation[2, 0] * dx + rotation[2, 1] * dy + rotation[2, 2]
+        for k in range(u.shape[0]):
+            other[k, i] = slope[k, i] = math.nan
+            wanted = u[k, i]
+            if not math.isfinite(wanted + dx + dy):
+                continue
+            # But for distortion the equation is linear in w = 1/z.
+            normal = (wanted - projector[2 + axis]) / projector[axis]
+            w = (normal * a2 - (a1 if axis else a0)) / ((t1 if axis else t0) - normal * t2)
+            for _ in range(_MAX_STEPS):
+                q = 1.0 / (a2 + w * t2)
+                if not q > 0.0:
+                    break
+                xn, yn = (a0 + w * t0) * q, (a1 + w * t1) * q
+                x, y, u_x, u_y, v_x, v_y = _image(projector, xn, yn)
+                x_w, y_w = (t0 - xn * t2) * q, (t1 - yn * t2) * q
+                along, across = u_x * x_w + u_y * y_w, v_x * x_w + v_y * y_w
+                if axis:
+                    x, y, along, across = y, x, across, along
+                step = (wanted - x) / along
+                w += step
+                if not abs(wanted - x) > _NEAR_PX:
+                    if w > 0.0 and xn * xn + yn * yn < projector[25]:
+                        other[k, i] = y + across * step
+                        slope[k, i] = across / along
+                    break
+
+
 def directions_plain(lens: Array, pixels: Array) -> Array:
     """Twin of `pixel_directions`: directions (n, 2) of ``pixels`` (n, 2) by twenty plain Newton steps."""
     u, v = pixels.T

@@ -52,7 +52,7 @@ def process_take(
     planned = decoder.first(first)
     timings["decode round 1"] = time.perf_counter() - began
     frames = {"round 1": sum(len(s.frames) for s in take.sequences(1).values())}
-    if 2 in take.rounds:
+    if 2 in take.rounds and scan.rounds != 1:
         began = time.perf_counter()
         second = _collect(take, 2, method, warnings, report)
         report("decoding round 2")
@@ -72,6 +72,7 @@ def process_take(
         timings_s=timings,
         bench=f"{take.manifest['bench'].get('name', 'unknown bench')}, take {take.manifest['uid']}",
         projector=corrected_for(take.rounds[1].get("response"), (take.manifest.get("rig") or {}).get("metadata", {})),
+        rounds=decoder.decision,
         warnings=[*warnings, *decoder.warnings],
     )
 

@@ -29,6 +29,7 @@ def summarise(
     timings_s: Mapping[str, float],
     bench: str,
     projector: str = "",
+    rounds: str = "",
     warnings: Sequence[str] = (),
 ) -> ScanResult:
     """Count, judge and pack a result.
@@ -51,6 +52,8 @@ def summarise(
         Where the frames come from, in words.
     projector
         What the patterns took its response to be, in words, where that is known.
+    rounds
+        What was decided about a second round and why, in words; empty where nothing was.
     warnings
         Sentences for the operator; those about failed gates are added.
     """
@@ -128,6 +131,7 @@ def summarise(
         {
             "bench": bench,
             **({"projector response": projector} if projector else {}),
+            **({"rounds": rounds} if rounds else {}),
             "counts": counts,
             "frames": dict(frames),
             "timings_s": dict(timings_s),

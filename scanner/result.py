@@ -37,6 +37,8 @@ class Flag(IntFlag):
     """Round two did not light this pixel's place, or cut its fringes."""
     INCOMPLETE = 1024
     """The recording ended before this pixel could be decided."""
+    THIRD_PATH = 2048
+    """Round one shows more than two light paths here: neither one nor two fit its fringes."""
 
 
 @dataclass(frozen=True)

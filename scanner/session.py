@@ -70,7 +70,8 @@ def run_scan(
             response = response_of(rig.metadata) if config.scan.correct_response else None
             light = None if response is None else response.values
             plan = replace(method.first_round(config.scan, bench.projector_size), response=light)
-            with _begin_take(folder.path / "take", loaded, bench, rig, plan, method.rounds) as take:
+            rounds = config.scan.rounds_at_most(method.rounds)
+            with _begin_take(folder.path / "take", loaded, bench, rig, plan, rounds) as take:
                 decoder = Decoder(method, config.scan, bench.noise, rig)
                 acquisition = Acquisition(bench, method, config.scan, decoder, take, listener, light)
                 maps = acquisition.run()
@@ -88,6 +89,7 @@ def run_scan(
             timings_s=timings,
             bench=name,
             projector=corrected_for(plan.response, rig.metadata),
+            rounds=decoder.decision,
             warnings=[*loaded.warnings, *acquisition.notes, *decoder.warnings],
         )
         write_result(

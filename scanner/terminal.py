@@ -159,6 +159,7 @@ class Terminal:
         rows: list[tuple[str, str]] = [
             ("method", result.method.upper() + ("   SIMULATED DATA" if result.simulated else "")),
             ("frames", frames),
+            *([("rounds", str(result.summary["rounds"]))] if "rounds" in result.summary else []),
             ("points", f"{counts['points']:,} of {counts['pixels']:,} pixels"),
         ]
         if counts["region"]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import OperatorError
 from scanner import optics
+from scanner.patterns import Axis
 from scanner.rig import Lens, Rig
 
 Map = NDArray[np.float32] | NDArray[np.float64]
@@ -131,9 +132,46 @@ def triangulate(
     return result
 
 
+def epipolar_crossings(rig: Rig, pixels: NDArray[np.intp], u: Map, axis: Axis) -> tuple[Map, Map]:
+    """Where the epipolar curves of camera pixels cross given projector columns or rows.
+
+    Parameters
+    ----------
+    rig
+        The calibrated rig.
+    pixels
+        (P,) flat numbers of camera pixels.
+    u
+        (K, P) projector column (``axis`` x) or row (y), px.
+
+    Returns
+    -------
+    other, slope
+        (K, P) the other coordinate, px, and its change with ``u``; NaN where the place is not one of a point in front
+        of camera and projector.
+    """
+    width = rig.camera.size[0]
+    if not pixels.size:
+        return np.empty(u.shape), np.empty(u.shape)
+    rows, columns = np.divmod(pixels, width)
+    directions = rig.camera.rays(np.stack([columns, rows], axis=1).astype(np.float64))
+    values = np.ascontiguousarray(u, np.float64)
+    other, slope = np.empty_like(values), np.empty_like(values)
+
+    def some(begin: int, end: int) -> None:
+        optics.epipolar_crossings(
+            directions, rig.projector.vector, rig.rotation, rig.translation, 0 if axis == "x" else 1, values, other,
+            slope, begin, end,
+        )  # fmt: skip
+
+    optics.in_blocks(pixels.size, some, at_least=4096)
+    return other, slope
+
+
 def compile_all() -> None:
     """Compile the lens and triangulation kernels into Numba's cache, so that no scan waits for it."""
     lens = Lens(np.eye(3), np.empty(0), (2, 1))
     rig = Rig(lens, lens, np.eye(3), np.array([1.0, 0.0, 0.0]))
     lens.project(lens.rays(np.zeros((1, 2))))
     triangulate(rig, np.ones((1, 2), np.float32), np.ones((1, 2), np.float32))
+    epipolar_crossings(rig, np.zeros(1, np.intp), np.ones((1, 1)), "x")

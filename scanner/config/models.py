@@ -198,6 +198,11 @@ class ScanSection(_Section):
         description="What round two lights. sound: only where direct light of the detected pixels can come from; "
         "literal: the paper's Eq. 21, which leaves unseen emitters lit.",
     )
+    rounds: Literal["auto", 1, 2] = Field(
+        2,
+        description="Rounds of mfs. 2: a second round follows wherever a bounce was detected; auto: only where the "
+        "separation of both light paths from round one alone does not suffice; 1: never. The other methods have one.",
+    )
     lit_margin_px: float = Field(
         6, ge=0, le=200, description="By how much the region that round two lights is grown, projector px."
     )
@@ -248,6 +253,10 @@ class ScanSection(_Section):
                     refusals.append(_refusal((name,), what, f"add `{axis}: […]`, or remove {axis} from axes"))
         _refuse(refusals)
         return self
+
+    def rounds_at_most(self, of_method: int) -> int:
+        """Rounds that a scan can take by a method that has ``of_method``."""
+        return 1 if self.rounds == 1 else of_method
 
     def fringe_field(self, axis: Axis) -> FieldPath | None:
         """Path, below this section, of the list of the fringes along ``axis``; None for the method's own."""

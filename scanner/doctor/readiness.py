@@ -215,7 +215,8 @@ def _planned(loaded: LoadedConfig, rig: Rig | None) -> Planned | Finding:
         plan = method.first_round(scan, (pattern[0], pattern[1]))
     except OperatorError as error:
         return Finding("configuration", "plan", Verdict.FAULT, error.message, error.remedy)
-    return Planned(plan, method.rounds, (frame[0], frame[1]), 1 if _bits(camera) <= 8 else 2)
+    rounds = scan.rounds_at_most(method.rounds)
+    return Planned(plan, rounds, (frame[0], frame[1]), 1 if _bits(camera) <= 8 else 2)
 
 
 def _size_of(section: Any) -> tuple[int, int] | None:

@@ -77,12 +77,17 @@ class FirstRound:
         What round one projected.
     private
         Whatever the method's own later steps need.
+    notes
+        Warnings for the operator.
+    decision
+        Whether a second round follows and why, in words; empty where there was nothing to decide.
     """
 
     maps: Maps
     plan: Plan
     private: object = None
     notes: list[str] = field(default_factory=list)
+    decision: str = ""
 
 
 class Method(Protocol):

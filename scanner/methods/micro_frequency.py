@@ -8,7 +8,6 @@ separation where it is clear.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -27,7 +26,6 @@ from scanner.interreflection import (
     variation_statistic,
 )
 from scanner.methods.base import (
-    EPIPOLAR_TOLERANCE_PX,
     FirstRound,
     RoundFrames,
     Setup,
@@ -36,14 +34,13 @@ from scanner.methods.base import (
     stepped_plan,
 )
 from scanner.methods.multi_frequency import DecodedAxis, decode_axes, one_path_maps
-from scanner.paths import choose_direct, separate_two_paths
+from scanner.methods.separated import Separated, phasors_of, separate_region
+from scanner.methods.sufficiency import Evidence, weigh
 from scanner.patterns import Axis, Plan
 from scanner.phasors import RoundPhasors
 from scanner.pooling import one_path_residuals
 from scanner.regions import continued, inside, lit_together, literal_mask, pitch, sound_mask
 from scanner.result import Flag, Maps
-from scanner.rig import Rig
-from scanner.triangulation import triangulate
 
 FREQUENCIES = 9
 """T: frequencies an axis; t = 0..8."""
@@ -57,12 +54,6 @@ _HALO_PX = 2
 _CLEARANCE_PX = 2
 """Fringes this near to the end of the lit set are cut by the projector's blur."""
 
-_CLEAR_ORDERS = 10.0
-"""χ² by which the next best pair of fringe orders must fit worse."""
-
-_CLEAR_CHOICE = 2.0
-"""The direct path must be e² times as likely as the bounce to stand for the pixel."""
-
 
 def frequencies(extent: int) -> tuple[float, ...]:
     """f_t = (n + t)/L, t = 0..8, with n the fringes of about 16 px in L px: (80 + t)/1280 for L = 1280."""
@@ -71,42 +62,16 @@ def frequencies(extent: int) -> tuple[float, ...]:
 
 
 @dataclass(frozen=True)
-class Separated:
-    """Direct path of the region's pixels from round one alone, arrays (P,) in the order of ``pixels``.
-
-    Parameters
-    ----------
-    shape
-        Of the picture, (H, W).
-    pixels
-        Flat pixel numbers.
-    u, sigma, bounce
-        By axis: direct coordinate and its σ, and the coordinate of the other path, px; NaN where not known.
-    plausible
-        Whether the separation fits: good enough to say where to light, where many pixels vote.
-    trusted
-        Whether the fringe orders and the choice of the direct path are clear as well: good enough to be a coordinate.
-    """
-
-    shape: tuple[int, ...]
-    pixels: NDArray[np.intp]
-    u: dict[Axis, NDArray[np.float32]]
-    sigma: dict[Axis, NDArray[np.float32]]
-    bounce: dict[Axis, NDArray[np.float32]]
-    plausible: NDArray[np.bool_]
-    trusted: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
 class _Private:
     decoded: dict[Axis, DecodedAxis]
     detection: Detection
     separated: Separated
+    evidence: Evidence
 
 
 @dataclass(frozen=True)
 class MicroFrequencyShifting:
-    """MFS, two rounds."""
+    """MFS, two rounds, or one where the scan is content with it."""
 
     name: str = "mfs"
     title: str = "Micro-frequency shifting, two rounds (after Opt. Express 27, 28293)"
@@ -126,7 +91,7 @@ class MicroFrequencyShifting:
         assert isinstance(frames, RoundPhasors)
         decoded = decode_axes(frames, setup)
         maps, usable = one_path_maps(frames, decoded, setup)
-        variations = [modulation_variation(_phasors(frames, a), d.gain) for a, d in decoded.items()]
+        variations = [modulation_variation(phasors_of(frames, a), d.gain) for a, d in decoded.items()]
         coordinates = [d.coordinates for d in decoded.values()]
         if setup.scan.detector == "variation":
             counts = [len(d.gain) for d in decoded.values()]
@@ -137,12 +102,13 @@ class MicroFrequencyShifting:
             detection = _detect_pooled(frames, decoded, usable, setup)
         else:
             detection = detect(statistic, dof, coordinates, usable, setup.scan.false_alarm_rate)
-        separated = _separate(frames, decoded, detection, setup)
+        refused = detection.region | detection.depth_edge | detection.suspicious
+        clean = usable & maps.valid & ~refused
+        separated = separate_region(frames, decoded, detection, clean, setup)
         flags = first_flags(usable, frames.saturated, [u for u in (maps.x_p, maps.y_p) if u is not None])
         flags[detection.region] |= np.uint16(Flag.INTERREFLECTION)
         flags[detection.depth_edge] |= np.uint16(Flag.DEPTH_EDGE)
         flags[detection.suspicious] |= np.uint16(Flag.MISFIT)
-        refused = detection.region | detection.depth_edge | detection.suspicious
         known = {
             a: (u, s) for a, u, s in (("x", maps.x_p, maps.sigma_x), ("y", maps.y_p, maps.sigma_y)) if u is not None
         }
@@ -154,6 +120,8 @@ class MicroFrequencyShifting:
             _put(sigma, separated, separated.sigma[axis])  # type: ignore[index]
             results[axis] = (u, sigma)
         flags.reshape(-1)[separated.pixels[separated.trusted]] |= np.uint16(Flag.SEPARATED)
+        for flag, which in ((Flag.THIRD_PATH, separated.third), (Flag.OFF_EPIPOLAR, separated.off_line)):
+            flags.reshape(-1)[separated.pixels[which]] |= np.uint16(flag)
         untold = detection.region & ((flags & Flag.SEPARATED) == 0)
         flags[untold] |= np.uint16(Flag.MISFIT)
         x, sigma_x = results.get("x", (None, None))
@@ -171,12 +139,18 @@ class MicroFrequencyShifting:
             y_p_round1=maps.y_p,
             score=detection.statistic,
         )
-        return FirstRound(refuse_off_epipolar(first, setup.rig), frames.plan, _Private(decoded, detection, separated))
+        evidence = weigh(separated, frames.plan.size)
+        return FirstRound(
+            refuse_off_epipolar(first, setup.rig),
+            frames.plan,
+            _Private(decoded, detection, separated, evidence),
+            decision=evidence.decision(setup.scan.rounds, frames.plan.frame_count) if separated.pixels.size else "",
+        )
 
     def second_round(self, first: FirstRound, setup: Setup) -> Plan | None:
-        """The same fringes, lit only where the scan's rule says; None where no bounce was detected."""
+        """The same fringes, lit only where the scan's rule says; None where there is no bounce or one round does."""
         assert isinstance(first.private, _Private)
-        if not first.private.detection.region.any():
+        if not first.private.detection.region.any() or first.private.evidence.one_round(setup.scan.rounds):
             return None
         size = first.plan.size
         if setup.scan.regional_rule == "literal":
@@ -267,92 +241,9 @@ def _detect_pooled(
     coordinates = [d.coordinates for d in decoded.values()]
     statistic, dof = misfit_statistic(coordinates)
     residuals = [
-        one_path_residuals(_phasors(frames, a), d.coordinates, d.sigma_z, d.gain, usable) for a, d in decoded.items()
+        one_path_residuals(phasors_of(frames, a), d.coordinates, d.sigma_z, d.gain, usable) for a, d in decoded.items()
     ]
     return detect_pooled(residuals, statistic, dof, coordinates, usable, setup.scan.false_alarm_rate)
-
-
-def _separate(frames: RoundPhasors, decoded: dict[Axis, DecodedAxis], detection: Detection, setup: Setup) -> Separated:
-    """Two paths of every region pixel on every axis, and which of them is direct."""
-    pixels = np.flatnonzero(detection.region)
-    none = np.zeros(pixels.size, bool)
-    empty = Separated(detection.region.shape, pixels, {}, {}, {}, none, none)
-    axes: Sequence[Axis] = tuple(decoded)
-    if not pixels.size or any(not _separable(_phasors(frames, a).frequency, frames.plan.extent(a)) for a in axes):
-        nan = np.full(pixels.size, np.nan, np.float32)
-        return replace(
-            empty, u=dict.fromkeys(axes, nan), sigma=dict.fromkeys(axes, nan), bounce=dict.fromkeys(axes, nan)
-        )
-    found = {}
-    for axis in axes:
-        phasors = _phasors(frames, axis)
-        z = phasors.z.reshape(len(phasors.frequency), -1)[:, pixels]
-        sigma_z = decoded[axis].sigma_z.reshape(-1)[pixels] * np.float32(np.sqrt(detection.excess_noise))
-        found[axis] = separate_two_paths(z, phasors.frequency, sigma_z, frames.plan.extent(axis), decoded[axis].gain)
-    distance = sigma = None
-    if setup.rig is not None and len(axes) == 2:
-        distance, sigma = _epipolar_distances(
-            setup.rig, pixels, found["x"].u, found["y"].u, found["x"].sigma_u, found["y"].sigma_u
-        )
-    choice = choose_direct(*(found[a] for a in axes), distance_px=distance, sigma_px=sigma)
-    column = np.arange(pixels.size)
-    picks = dict(zip(axes, (choice.ix, choice.iy), strict=False))
-    plausible = choice.confidence > 0
-    if distance is not None and sigma is not None:
-        # A pixel that looks into a mirror sees two bounces and nothing direct: neither pair is on its epipolar line.
-        pair = 2 * choice.ix + choice.iy
-        plausible &= distance[pair, column] < EPIPOLAR_TOLERANCE_PX + 5 * sigma[pair, column]
-    clear = choice.confidence > _CLEAR_CHOICE
-    u, spread, bounce = {}, {}, {}
-    for axis in axes:
-        two, pick = found[axis], picks[axis]
-        u[axis], spread[axis] = two.u[pick, column], two.sigma_u[pick, column]
-        bounce[axis] = two.u[1 - pick, column]
-        plausible &= two.converged & (two.chi2 < chi2_distribution.isf(1 / _REFUSED_ONE_IN, two.dof))
-        clear &= two.margin > _CLEAR_ORDERS
-        extent = frames.plan.extent(axis)
-        plausible &= (u[axis] >= -0.5) & (u[axis] <= extent - 0.5)
-    return Separated(detection.region.shape, pixels, u, spread, bounce, plausible, plausible & clear)
-
-
-def _epipolar_distances(
-    rig: Rig,
-    pixels: NDArray[np.intp],
-    x: NDArray[np.float32],
-    y: NDArray[np.float32],
-    sigma_x: NDArray[np.float32],
-    sigma_y: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(4, P) distance (px) of each (x_i, y_j), ij = 00, 01, 10, 11, from its pixel's epipolar line, and its σ."""
-    width, height = rig.camera.size
-    distance = np.empty((4, pixels.size), np.float32)
-    sigma = np.empty_like(distance)
-    blank = np.full(width * height, np.nan, np.float32)
-    for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
-        planes = []
-        for values in (x[i], sigma_x[i], y[j], sigma_y[j]):
-            plane = blank.copy()
-            plane[pixels] = values
-            planes.append(plane.reshape(height, width))
-        found = triangulate(rig, *planes)
-        assert found.epipolar_px is not None
-        assert found.epipolar_sigmas is not None
-        distance[k] = found.epipolar_px.reshape(-1)[pixels]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            sigma[k] = np.abs(distance[k] / found.epipolar_sigmas.reshape(-1)[pixels])
-    return distance, sigma
-
-
-def _phasors(frames: RoundPhasors, axis: Axis):  # type: ignore[no-untyped-def]
-    phasors = frames.axis(axis)
-    assert phasors is not None
-    return phasors
-
-
-def _separable(frequency: NDArray[np.float64], extent: int) -> bool:
-    """Whether two paths can be separated with these frequencies: what `separate_two_paths` asks for."""
-    gaps = np.diff(np.sort(frequency))
-    return frequency.size >= 5 and bool(np.allclose(gaps, gaps[0], rtol=1e-6)) and gaps[0] * extent <= 1 + 1e-9
 
 
 def _put(plane: NDArray[np.float32], separated: Separated, values: NDArray[np.float32]) -> None:

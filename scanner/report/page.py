@@ -89,6 +89,7 @@ def _header(result: ScanResult, title: str) -> str:
         "Date": created and str(created).replace("T", " ").replace("+00:00", " UTC"),
         "Camera": "{1} × {0} px".format(*result.maps.flags.shape),
         "Projector": result.summary.get("projector response"),
+        "Rounds": result.summary.get("rounds"),
     }
     listed = "".join(f"<div><dt>{k}</dt><dd>{escape(str(v))}</dd></div>" for k, v in facts.items() if v)
     simulated = (

@@ -25,6 +25,7 @@ _FLAGS: tuple[tuple[Flag, str, str], ...] = (
     (Flag.OUT_OF_VOLUME, "#8d6e46", "refused: outside the projector picture, or not in front of the rig"),
     (Flag.OFF_EPIPOLAR, "#d3a21a", "refused: (x, y) does not lie on the pixel's epipolar line"),
     (Flag.MISFIT, "#e25a2c", "refused: the fringes do not fit one path"),
+    (Flag.THIRD_PATH, "#a8481c", "sees more than two light paths"),
     (Flag.NOT_LIT, "#12456b", "round two did not light this place"),
     (Flag.INCOMPLETE, "#b9bdc3", "the recording ended before this pixel was decided"),
     (Flag.LOW_MODULATION, "#3b4048", "too little fringe modulation: shadow, black surface, background"),

@@ -124,6 +124,54 @@ def test_no_bounce_no_second_round(array_bench, tmp_path):
     assert 2 not in Take.open(tmp_path / "take").rounds
 
 
+def far_bounce(array_bench):
+    """A bench whose bounce comes from far away on both axes: one round separates it."""
+    bench = array_bench()
+    bench.y_bounce = bench.y + 70
+    return bench
+
+
+def test_second_round_is_skipped_where_the_first_suffices(array_bench, tmp_path):
+    bench = far_bounce(array_bench)
+    job = acquisition(bench, tmp_path, steps=12, rounds="auto")
+    maps = run(job)
+    assert bench.exposures == 2 + 216
+    take = Take.open(tmp_path / "take")
+    assert 2 not in take.rounds
+    assert "round two is not needed, 216 frames are saved" in job.decoder.decision
+    assert job.decoder.decision in job.listener.notes
+    assert maps.lit is None
+    region = bench.alpha > 0
+    for error in (np.abs(maps.x_p - bench.x)[region], np.abs(maps.y_p - bench.y)[region]):
+        # Coordinates that are there are right, and nearly all are there.
+        assert np.isfinite(error).mean() > 0.97
+        assert (error[np.isfinite(error)] < 0.25).mean() > 0.99
+    assert (maps.flags[region & maps.valid & maps.interreflection] & Flag.SEPARATED).all()
+
+
+def test_second_round_follows_where_the_first_leaves_doubt(array_bench, tmp_path):
+    # 11 px apart on the axis y: without a rig these are as good as one path.
+    bench = array_bench()
+    job = acquisition(bench, tmp_path, rounds="auto")
+    maps = run(job)
+    assert bench.exposures == 2 + 108 + 2 + 108
+    assert job.decoder.decision.startswith("round two follows: ")
+    assert "more than 2 times the noise of direct light alone" in job.decoder.decision
+    assert maps.lit is not None
+
+
+def test_one_round_if_it_is_asked_for(array_bench, tmp_path):
+    bench = array_bench()
+    job = acquisition(bench, tmp_path, rounds=1)
+    maps = run(job)
+    assert bench.exposures == 2 + 108
+    assert all(p.rounds == 1 for p in job.listener.frames)
+    # What is in doubt is left out, and says why.
+    lost = maps.interreflection & ~maps.valid
+    assert lost.any()
+    assert (maps.flags[lost] != 0).all()
+
+
 def test_bad_sequence_is_repeated_and_the_result_is_good(array_bench, tmp_path):
     # Two preflight pictures, then sequence 3 (frames 14..19): its fourth frame shows the third pattern again.
     bench = array_bench(on_expose=lambda number, index: 2 if number == 2 + 12 + 3 else None)

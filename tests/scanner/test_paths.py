@@ -340,6 +340,15 @@ def test_unknown_paths_are_not_chosen():
     assert np.isnan(choice.confidence[2])
 
 
+def test_agreement_of_weak_paths_counts_no_more_than_of_strong_ones():
+    x, _ = two_paths([[100.0], [400.0]], [[80.0], [40.0]])
+    y, _ = two_paths([[300.0], [500.0]], [[80.0], [40.0]])
+    choice = choose_direct(x, y)
+    assert (choice.ix[0], choice.iy[0]) == (0, 0)
+    # Nothing but the order of the amplitudes speaks, and that once.
+    assert choice.confidence[0] == pytest.approx(np.log(9), abs=0.02)
+
+
 def test_epipolar_term_needs_both_axes_and_its_sigma():
     x, _ = two_paths([[100.0], [400.0]], [[80.0], [32.0]])
     with pytest.raises(ValueError, match="both axes"):

@@ -8,7 +8,7 @@ import pytest
 
 from scanner import optics
 from scanner.rig import Lens, Rig
-from scanner.triangulation import TriangulationError, triangulate
+from scanner.triangulation import TriangulationError, epipolar_crossings, triangulate
 
 SIZE = (160, 120)
 CAMERA_MATRIX = np.array([[260.0, 0, 80.25], [0, 258.0, 58.5], [0, 0, 1]])
@@ -251,3 +251,22 @@ def test_frames_of_another_camera_are_refused() -> None:
         triangulate(rig, view.x_p, sigmas(), view.y_p)
     with pytest.raises(TriangulationError, match="neither"):
         triangulate(rig, None, None)
+
+
+@pytest.mark.parametrize("distortions", [MILD, (FULL, FULL)], ids=["mild", "full"])
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_epipolar_curve_crosses_where_opencv_projects_its_points(distortions, axis):
+    rig = rig_of(distortions)
+    view = view_of(rig)
+    pixels = np.arange(SIZE[0] * SIZE[1])
+    along, across = (view.x_p, view.y_p) if axis == "x" else (view.y_p, view.x_p)
+    u = np.stack([along.ravel(), along.ravel() + 0.5])
+    other, slope = epipolar_crossings(rig, pixels, u, axis)
+    # Half a pixel along the curve may leave what the lens models reach, for few.
+    ok = np.isfinite(other).all(axis=0)
+    assert ok.mean() > 0.95
+    assert np.abs(other[0] - across.ravel())[ok].max() < 1e-3
+    # The curve bends by less than that over half a pixel.
+    assert np.abs((other[1] - other[0]) / 0.5 - slope[0])[ok].max() < 2e-2
+    unknown = np.full((1, pixels.size), np.nan)
+    assert np.isnan(epipolar_crossings(rig, pixels, unknown, axis)[0]).all()
