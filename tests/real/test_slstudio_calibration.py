@@ -17,8 +17,10 @@ from calibration.solver.refusal import CalibrationError
 from calibration.solver.result import Calibration
 from calibration.solver.selection import Terms
 from scanner.rig import Rig
+from scanner.triangulation import triangulate
 
 FOLDER = Path(__file__).resolve().parents[3] / "shared" / "data" / "slstudio" / "calibration"
+SKULL = FOLDER.parent / "skull_2x3"
 
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason=f"the real captures {FOLDER} are not on this machine")
 
@@ -74,9 +76,81 @@ def test_all_six_poses_agree_better_than_published(calibration: Calibration):
 def test_focal_length_and_baseline_are_those_published(calibration: Calibration, published: Rig):
     focal = np.diag(calibration.rig.camera.matrix)[:2]
     assert np.abs(focal / published.camera.matrix[0, 0] - 1).max() < 0.005
-    # 1.1 % above the published 164.5 mm whatever is assumed (exact or estimated board, without any one pose: 166.1 to
-    # 166.5 mm); the published projector has residuals of 0.46 px where these are 0.17.
+    # 1.1 % above the published 164.5 mm whatever is assumed (exact or estimated board, k1 or all terms, without any one
+    # pose: 166.1 to 166.7 mm). The next two tests say why it is not 1 %.
     assert calibration.baseline[0] == pytest.approx(np.linalg.norm(published.translation), rel=0.013)
+
+
+def test_the_authors_way_gives_what_they_published(poses: list[PoseObservation], published: Rig):
+    """OpenCV with their restrictions and from their five poses: the points are theirs, the rig differs by the model.
+
+    They hold the camera's centre in the middle of its picture, which these frames place 13 px (18 σ) off, and the lenses
+    as calibrated one by one while the projector's pose is estimated.
+    """
+    board, camera, projector = [], [], []
+    for pose in (poses[i] for i in (0, 2, 3, 4, 5)):
+        both = np.isfinite(pose.projector).all(axis=1)
+        for points, kept in ((pose.points_board, board), (pose.camera, camera), (pose.projector, projector)):
+            kept.append(points[both].astype(np.float32))
+    plain = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    _, camera_matrix, camera_terms, *_ = cv2.calibrateCamera(
+        board, camera, CAMERA_SIZE, None, None, flags=plain | cv2.CALIB_FIX_PRINCIPAL_POINT
+    )
+    guess = np.array([[2600.0, 0, 911.5], [0, 2600, 1100], [0, 0, 1]])
+    _, projector_matrix, projector_terms, *_ = cv2.calibrateCamera(
+        board, projector, PROJECTOR_SIZE, guess, np.zeros(5), flags=plain | cv2.CALIB_USE_INTRINSIC_GUESS
+    )
+    *_, shift, _, _ = cv2.stereoCalibrate(
+        board, camera, projector, camera_matrix, camera_terms, projector_matrix, projector_terms, CAMERA_SIZE,
+        flags=cv2.CALIB_FIX_INTRINSIC,
+    )  # fmt: skip
+    assert camera_matrix[0, 0] == pytest.approx(published.camera.matrix[0, 0], rel=0.005)
+    assert projector_matrix[0, 0] == pytest.approx(published.projector.matrix[0, 0], rel=0.001)
+    assert np.linalg.norm(shift) == pytest.approx(np.linalg.norm(published.translation), rel=0.01)
+
+
+def test_the_published_rig_does_not_fit_the_frames_it_came_with(poses: list[PoseObservation], published: Rig):
+    """Its camera does; its projector misses the same corners by pixels, where it is said to err by 0.46 px."""
+    camera, projector = [], []
+    for pose in poses:
+        both = np.isfinite(pose.projector).all(axis=1)
+        board, seen = pose.points_board[both], pose.camera[both]
+        _, turn, shift = cv2.solvePnP(board, seen, published.camera.matrix, published.camera.distortion)
+        X = board @ cv2.Rodrigues(turn)[0].T + shift.ravel()
+        camera.append(published.camera.project(X) - seen)
+        projector.append(published.projector.project(published.to_projector_frame(X)) - pose.projector[both])
+    camera_rms, projector_rms = (np.sqrt((np.concatenate(e) ** 2).sum(axis=1).mean()) for e in (camera, projector))
+    assert camera_rms < 0.282  # as published
+    assert 3 < projector_rms < 4.5
+
+
+def test_the_skull_by_this_rig_and_by_others(poses: list[PoseObservation], calibration: Calibration, published: Rig):
+    """Shapes up to a rigid motion: rigs of five poses agree to 0.1 mm, the published one differs by its projector."""
+    frames = np.array([cv2.imread(str(SKULL / f"{i:02d}.png"), cv2.IMREAD_GRAYSCALE) for i in range(6)], float)
+    column, sigma, _ = decoded(frames, PROJECTOR_SIZE[0])
+
+    def shape(rig: Rig) -> np.ndarray:
+        return triangulate(rig, column, sigma).points.astype(float)
+
+    own = shape(calibration.rig)
+    exact = [calibrate_rig(poses[:i] + poses[i + 1 :], CAMERA_SIZE, PROJECTOR_SIZE).rig for i in range(6)]
+    others = [apart(own, shape(rig)) for rig in exact]
+    from_published = apart(own, shape(published))
+    print("\nskull, r.m.s. mm: rigs without one pose", np.round(others, 3), "published rig", round(from_published, 3))
+    assert np.median(others) < 0.15
+    # 0.15 mm was asked for. OpenCV's calibration in the authors' way, from the same points, is 0.27 mm from theirs.
+    assert from_published < 0.30
+
+
+def apart(first: np.ndarray, second: np.ndarray) -> float:
+    """Root mean square distance of corresponding points after the best rigid motion (Kabsch, 1976)."""
+    depth = first[..., 2]
+    # A skull is within a hand's breadth of its median; what is beyond are fringe orders that the coarse phase missed.
+    near = np.abs(depth - np.nanmedian(depth)) < 100
+    both = near & np.isfinite(second[..., 2])
+    a, b = (points[both] - points[both].mean(axis=0) for points in (first, second))
+    u, _, vt = np.linalg.svd(a.T @ b)
+    return float(np.sqrt(((a - b @ (u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt).T) ** 2).sum(axis=1).mean()))
 
 
 def test_an_exact_board_fits_worse_but_meets_the_same_figures(poses: list[PoseObservation], published: Rig):
