@@ -84,8 +84,8 @@ def test_focal_length_and_baseline_are_those_published(calibration: Calibration,
 def test_the_authors_way_gives_what_they_published(poses: list[PoseObservation], published: Rig):
     """OpenCV with their restrictions and from their five poses: the points are theirs, the rig differs by the model.
 
-    They hold the camera's centre in the middle of its picture, which these frames place 13 px (18 σ) off, and the lenses
-    as calibrated one by one while the projector's pose is estimated.
+    They hold the camera's centre in the middle of its picture, which these frames place 13 px (18 σ) off, and the
+    lenses as calibrated one by one while the projector's pose is estimated.
     """
     board, camera, projector = [], [], []
     for pose in (poses[i] for i in (0, 2, 3, 4, 5)):
