@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from requirements import require
 
 from calibration.boards import AsymmetricCircles, Charuco, Chessboard, load_board
 from calibration.detection import find_board
@@ -142,7 +143,6 @@ def test_place_that_cannot_be_written_is_told(tmp_path):
         print_board(Chessboard(columns=6, rows=5, square_mm=10.0), tmp_path / "no" / "board.pdf")
 
 
-@pytest.mark.skipif(shutil.which("pdftoppm") is None, reason="pdftoppm (poppler) is not on this machine")
 @pytest.mark.parametrize(
     "board",
     [
@@ -153,6 +153,7 @@ def test_place_that_cannot_be_written_is_told(tmp_path):
     ids=lambda board: board.kind,
 )
 def test_rendered_pdf_is_read_by_the_detector(tmp_path, board):
+    require(shutil.which("pdftoppm"), "pdftoppm (poppler-utils) is not on this machine")
     print_board(board, tmp_path / "board.pdf")
     dpi = 200
     command = ["pdftoppm", "-r", str(dpi), "-gray", "-singlefile", str(tmp_path / "board.pdf"), str(tmp_path / "board")]
