@@ -201,16 +201,22 @@ def judge(books: Books, light: Formula, camera: SimulatedCamera, tally: Tally, c
     preflight = wrong.keys() - {number for exposures in books.attempts.values() for number in exposures}
     committed_wrong = False
     refused = []
-    revoked_wrong = [key for key in books.revoked if any(number in wrong for number in books.attempts[key])]
+    counted = [*books.committed, *books.revoked]
+    counted_wrong = [key for key in counted if any(number in wrong for number in books.attempts[key])]
 
     def contradicted(key: tuple[int, int, int]) -> bool:
-        """Whether a good sequence was revoked because of a wrong one that counted until it was revoked as well.
+        """Whether a good sequence was refused because of a wrong one that counted then.
 
-        Of three frequencies two are at odds alike.
+        Until it was revoked, all others of its round may have contradicted it. And of three frequencies two are at odds
+        alike, and as much as would do harm in the one may do none in the other.
         """
-        axis = books.plans[key[0]].sequences[key[1]].axis
-        others = [k for k in revoked_wrong if k[0] == key[0] and books.plans[k[0]].sequences[k[1]].axis == axis]
-        return key in books.revoked and bool(others)
+        number, sequence, _ = key
+        plan = books.plans[number]
+        axis = [s for s, f in enumerate(plan.sequences) if f.axis == plan.sequences[sequence].axis]
+        wrong_then = {k[1] for k in counted_wrong if k[0] == number}
+        if key in books.revoked:
+            return len(axis) == 3 and bool(wrong_then & set(axis))
+        return bool({k[1] for k in books.revoked if k[0] == number} & wrong_then)
 
     for key, exposures in books.attempts.items():
         bad = [number for number in exposures if number in wrong]

@@ -5,8 +5,9 @@ the very error that would go into a coordinate, and its noise is known. A frame 
 (2/N) (e/B) sin(φ + δ), and what e can be is known as well: over hundreds of pixels a tenth of the noise is seen.
 
 Two things are not to be taken for a fault. Bounces and depth edges fit no coordinate: only pixels vote whose other
-phases agree, and of these the majority. And there is what makes all phases a little wrong, as gamma does with few
-steps, or the optics: a sequence is compared with the rest of its round.
+phases agree, and of these the majority; and what changes smoothly with the frequency is a bounce. And there is what
+makes all phases a little wrong, as gamma does with few steps, or the optics: a sequence is compared with the others
+of its round.
 """
 
 from __future__ import annotations
@@ -29,19 +30,26 @@ _STANDS_OUT = 4.0
 """A sequence with so many times the energy of a typical one stands out; systematic errors are alike in all."""
 
 _BY_CHANCE = 1e-9
+_CONFIRMED, _STAYS = 0.5, 0.5
+_LEAST_WEIGHT = 0.05
+"""Of a coordinate's information. A frequency far below the others carries none, and sees bounces that they do not."""
+
+_LEAST_LEFT = 0.1
+"""Of the energy of an error that must be left in a residual for it to tell anything."""
+
 _REFUSED = 0.1
 """The share of good pixels that do not vote."""
 
 _CLEAN = 0.25
 """So many pixels, at least, see one path of light."""
 
+_MOST = 2.0
+"""χ² of a vote in units of what noise makes of it: beyond, the others do not agree, whatever it is."""
+
 _OUTLIER = 3.0
 _GROUPS = 4
 _ITERATIONS = 4
 _FEWEST_OF_BAND = 80
-_LEAST_SPREAD = 0.9
-"""Few residuals lie close to what was fitted to them: their noise is not less than the one that was measured."""
-
 _SAME = 1.5
 """Variance of the difference of two takes, in units of that of their noise, up to which they are the same."""
 
@@ -64,6 +72,8 @@ class Shown:
         From 1.
     former
         (P,) the frame that was taken before its first one, DN; None where there was none.
+    sure
+        Whether its steps were enough to tell every harmful error of a frame by themselves.
     """
 
     axis: Axis
@@ -73,6 +83,7 @@ class Shown:
     usable: NDArray[np.bool_]
     round: int
     former: NDArray[np.float32] | None = None
+    sure: bool = False
 
 
 def standing_out(shown: Sequence[Shown], extent: Mapping[Axis, int], cells: Grid) -> NDArray[np.float64]:
@@ -93,20 +104,30 @@ def standing_out(shown: Sequence[Shown], extent: Mapping[Axis, int], cells: Grid
     """
     sure = np.zeros(len(shown))
     axes = {axis: [i for i, s in enumerate(shown) if s.axis == axis] for axis in extent}
-    judged = {axis: _judged([shown[i] for i in members], extent[axis], cells) for axis, members in axes.items()}
-    every = np.concatenate([found.energy for found in judged.values()])
-    if not len(every):
-        return sure
-    typical = np.quantile(every, _TYPICAL, axis=0, method="lower")
-    for axis, found in judged.items():
-        for t, energy in enumerate(found.energy):
-            odd = (found.certain[t] > 1) & (energy > HARMFUL * found.left[t]) & (energy > _STANDS_OUT * typical)
-            if odd.any():
-                # What a bounce leaves in all of them does not go away with one of them.
-                rest = _judged([shown[i] for n, i in enumerate(axes[axis]) if n != t], extent[axis], cells)
-                odd &= energy > _STANDS_OUT * rest.energy.max(axis=0, initial=0)
-            sure[axes[axis][t]] = np.where(odd, found.certain[t], 0).max()
+
+    def judged(smooth: bool) -> dict[Axis, _Judged]:
+        return {a: _judged([shown[i] for i in members], extent[a], cells, smooth) for a, members in axes.items()}
+
+    found = judged(smooth=False)
+    suspected = _odd(found, 1)
+    if any(there.any() for there in suspected.values()):
+        again = judged(smooth=True)
+        confirmed = _odd(again, _CONFIRMED)
+        for axis, there in suspected.items():
+            # A wrong frame is as wrong either way; of a bounce most is gone.
+            there &= confirmed[axis] & (again[axis].moved > _STAYS * found[axis].moved)
+            sure[axes[axis][: len(there)]] = np.where(there, found[axis].certain, 0).max(axis=1)
     return sure
+
+
+def _odd(found: Mapping[Axis, _Judged], least: float) -> dict[Axis, NDArray[np.bool_]]:
+    """(T, R) by axis, where the sequences stand out, are surely wrong, and do harm."""
+    every = np.concatenate([judged.energy for judged in found.values()])
+    typical = np.maximum(np.quantile(every, _TYPICAL, axis=0, method="lower"), 0) if len(every) else np.inf
+    return {
+        axis: (one.certain > least) & (one.moved > HARMFUL) & (one.energy > _STANDS_OUT * typical)
+        for axis, one in found.items()
+    }
 
 
 def same(former: Shown, now: Shown) -> bool:
@@ -130,15 +151,20 @@ class _Judged:
     certain: NDArray[np.float64]
     left: NDArray[np.float64]
 
+    @property
+    def moved(self) -> NDArray[np.float64]:
+        """(T, R) the mean square of the error that would explain it, in units of the noise."""
+        return np.asarray(self.energy / self.left[:, None])
 
-def _judged(shown: Sequence[Shown], extent: int, cells: Grid) -> _Judged:
+
+def _judged(shown: Sequence[Shown], extent: int, cells: Grid, smooth: bool) -> _Judged:
     nothing = _Judged(np.empty((0, cells.bands + 1)), np.empty((0, cells.bands + 1)), np.empty(0))
     if len(shown) < _FEWEST_FREQUENCIES:
         return nothing
     pixels = np.flatnonzero(np.logical_and.reduce([s.usable for s in shown]))
     if pixels.size < FEWEST:
         return nothing
-    residuals = _residuals(shown, pixels, extent, cells)
+    residuals = _residuals(shown, pixels, extent, cells, smooth)
     regions = _regions(cells, pixels)
     found = np.array([[_of_a_frame(one, there) for there in regions] for one in residuals])
     return _Judged(found[..., 0], found[..., 1], np.array([one.left for one in residuals]))
@@ -160,8 +186,13 @@ class _Residual:
     column: NDArray[np.intp]
 
 
-def _residuals(shown: Sequence[Shown], pixels: NDArray[np.intp], extent: int, cells: Grid) -> list[_Residual]:
-    """What each phase is off by from where the others have it (leave-one-out residuals of a linear fit)."""
+def _residuals(
+    shown: Sequence[Shown], pixels: NDArray[np.intp], extent: int, cells: Grid, smooth: bool
+) -> list[_Residual]:
+    """What each phase is off by from where the others have it (leave-one-out residuals of a linear fit).
+
+    ``smooth`` takes away whatever changes slowly with the frequency as well, as a weak bounce from nearby does.
+    """
     # Heavy, and not needed before a round ends.
     from scipy.stats import chi2
 
@@ -179,14 +210,20 @@ def _residuals(shown: Sequence[Shown], pixels: NDArray[np.intp], extent: int, ce
     turned = z * np.exp(-1j * phases) / sigma
     along, across = turned.real, turned.imag
     b = np.maximum(gain @ along / (gain @ gain), 0)
-    slope = gain * frequency / np.linalg.norm(gain * frequency)
-    across = across - slope[:, None] * (slope @ across)
+    # Position, and where there are frequencies enough an offset and a curvature of the phase.
+    free = 1 + min(2, (len(shown) - 3) // 2) if smooth else 1
+    basis = np.linalg.qr((gain * np.power.outer(frequency / frequency.mean(), [1, 0, 2][:free]).T).T)[0]
+    across = across - basis @ (basis.T @ across)
     along = along - gain[:, None] * b
-    left = 1 - slope**2
-    degrees = 2 * len(shown) - 3
+    left = 1 - np.square(basis).sum(axis=1)
+    weight = np.square(gain * frequency) / np.square(gain * frequency).sum()
+    asked = (left > _LEAST_LEFT) & (weight > _LEAST_WEIGHT) & ~np.array([s.sure for s in shown])
+    left = np.maximum(left, _LEAST_LEFT)
+    degrees = 2 * len(shown) - 2 - free
     # χ² of everything but the phase in question. Bounces may be everywhere and raise it, but not to the same height.
     rest = np.square(across).sum(axis=0) + np.square(along).sum(axis=0) - across**2 / left[:, None]
-    agreeing = float(chi2.isf(_REFUSED, degrees) / chi2.ppf(_CLEAN, degrees))
+    highest = float(chi2.isf(_REFUSED, degrees))
+    agreeing = highest / float(chi2.ppf(_CLEAN, degrees))
     column = cells.columns_px[pixels]
     found = []
     for t, one in enumerate(shown):
@@ -196,7 +233,7 @@ def _residuals(shown: Sequence[Shown], pixels: NDArray[np.intp], extent: int, ce
                 across[t] / np.sqrt(left[t]),
                 float(left[t]),
                 _shapes(phases[t], b, former),
-                rest[t] < agreeing * np.quantile(rest[t], _CLEAN),
+                asked[t] & (rest[t] < min(agreeing * np.quantile(rest[t], _CLEAN), _MOST * highest)),
                 column,
             )
         )
@@ -237,7 +274,8 @@ def _of_a_frame(one: _Residual, there: NDArray[np.bool_]) -> tuple[float, float]
     for _ in range(_ITERATIONS):
         shares, energy, degrees = _fit(shapes[kept], off[kept])
         rest = off - shapes @ shares
-        spread = max(1.4826 * float(np.median(np.abs(rest))), _LEAST_SPREAD)
+        freedom = kept.size / max(kept.size - degrees, 1)
+        spread = max(1.4826 * float(np.median(np.abs(rest))) * float(np.sqrt(freedom)), 1.0)
         kept = np.abs(rest) < _OUTLIER * spread
     certain = energy / (spread**2 * float(chi2.isf(_BY_CHANCE, degrees)))
     if certain > 1:

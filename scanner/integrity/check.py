@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from drivers import Pixels
 from scanner.integrity.codes import wrong_codes
 from scanner.integrity.findings import SEQUENCE, Finding, SequenceCheck
+from scanner.integrity.frame_errors import formed_excess
 from scanner.integrity.history import SequenceHistory
 from scanner.integrity.naming import culprits
 from scanner.integrity.profiles import check_pairs
@@ -97,16 +98,23 @@ def check_sequence(
     if np.count_nonzero(waveform.usable) >= FEWEST:
         if not findings:
             findings += _errors(
-                values[:stepped], steps, waveform, reference, cells, found, bool(history and history.linear)
+                values[:stepped],
+                steps,
+                waveform,
+                reference,
+                cells,
+                found,
+                bool(history and history.linear),
+                history.latest if history else None,
             )
-            if history and reference and findings and history.doubt_levels(waveform, valid, cells, stepped):
+            if history and reference and findings and history.doubt_former(fringes, waveform, valid, cells, stepped):
                 findings = []
         if history and not findings:
             findings += _among_others(values, valid, fringes, waveform, history, cells)
     elif history and not findings and (lost := history.lost_light(values[:stepped], waveform, valid)):
         findings.append(Finding(SEQUENCE, lost))
     if history:
-        if findings and history.begins_with_the_former(values[0], waveform):
+        if findings and history.begins_with_the_former(values[:stepped], steps, waveform, valid):
             findings.insert(0, Finding(0, "frame 1 is still the last picture of the sequence before"))
         history.ended(values[-1], not findings)
         if not findings:
@@ -123,11 +131,13 @@ def _errors(
     cells: Grid,
     found: NDArray[np.float64],
     linear: bool,
+    former: NDArray[np.float32] | None,
 ) -> list[Finding]:
     """Errors of single frames; ``found`` takes the steps that the frames had."""
     found[: len(steps)] = steps
     if free_harmonics(len(steps)) > 1:
         beyond = excess(waveform, cells)
+        beyond = np.concatenate([beyond, formed_excess(waveform, steps, cells, former)])
         if linear:
             beyond = np.concatenate([beyond, harmonic_excess(waveform, cells)])
         if beyond.max() > 1:
@@ -182,9 +192,9 @@ def _among_others(
 ) -> list[Finding]:
     """What only the sequences before, or the code of several frequencies, can tell."""
     few = fringes.frequency is None or len(fringes.fringes) < 6
-    if few and history.begins_with_the_former(values[0], waveform):
-        return [Finding(0, "frame 1 is still the last picture of the sequence before")]
     stepped = values[: np.count_nonzero([f.frequency == fringes.fringes[0].frequency for f in fringes.fringes])]
+    if few and history.begins_with_the_former(stepped, fringes.steps_rad[: len(stepped)], waveform, valid):
+        return [Finding(0, "frame 1 is still the last picture of the sequence before")]
     told = [history.lost_light(stepped, waveform, valid)]
     extent = history.extent(fringes.axis)
     if fringes.frequency is not None:

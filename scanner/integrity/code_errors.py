@@ -25,6 +25,9 @@ _REFUSED = 0.2
 _MISFITTING = 0.65
 """Bounces spoil the codes of some pixels and leave the others alone; wrong frames spoil those of nearly all."""
 
+_LARGE = 0.03
+"""Mean square of the error of a frame, in units of B², of which several hide each other by making all codes wrong."""
+
 _ONE_IN = 0.01
 _BY_CHANCE = 1e-9
 
@@ -133,7 +136,8 @@ def _several(codes: Codes) -> bool:
     without = codes.misfit * np.square(left).sum(axis=0) / np.maximum(energy, 1e-12)
     misfitting = float((without > chi2.isf(_ONE_IN, degrees)).mean())
     before, after = float(np.median(codes.misfit)), float(np.median(without))
-    return misfitting > _MISFITTING and bool(before - after < _EXPLAINED * (before - degrees))
+    large = float(np.median(np.square(left).mean(axis=0))) > _LARGE
+    return large and misfitting > _MISFITTING and before - after < _EXPLAINED * (before - degrees)
 
 
 def _wrong_step(codes: Codes) -> list[Finding]:

@@ -23,10 +23,13 @@ class Finding:
 
 @dataclass(frozen=True)
 class AtOdds:
-    """A sequence of ``axis`` and ``frequency`` (1/px) that contradicts the rest of its round, and how, in words."""
+    """A sequence of ``axis`` and ``frequency`` (1/px) that contradicts the rest of its round, and how, in words.
+
+    ``frequency`` is None where the frames of the sequence have several.
+    """
 
     axis: Axis
-    frequency: float
+    frequency: float | None
     message: str
 
 

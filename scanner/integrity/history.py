@@ -17,13 +17,13 @@ from drivers import Pixels
 from scanner.integrity.agreement import Shown, same, standing_out
 from scanner.integrity.findings import AtOdds
 from scanner.integrity.sampling import Grid, gradients, grid
-from scanner.integrity.waveform import FEWEST, Reference, Waveform, other_mean
+from scanner.integrity.waveform import FEWEST, Reference, Waveform, free_harmonics, other_mean, series
 from scanner.patterns import Axis, FringeSequence
 
 _LOST = 0.2
 _STRONG = 0.4
 _UNCLIPPED = 0.97
-_SAME_PICTURE = 1.5
+_SAME_PICTURE, _OTHER_PICTURE = 1.5, 4.0
 _DIVERSE = 0.5
 _SAME_PHASES = 1.5
 _CONVINCED = 50.0
@@ -43,6 +43,8 @@ class SequenceHistory:
         Whether the projector has been found to respond linearly, and never otherwise.
     noise_dn
         Of a grey value in the sequences so far, DN; infinite before the first.
+    latest
+        (P,) the last frame of the latest sequence, good or not, at the sampled pixels.
 
     Notes
     -----
@@ -53,9 +55,11 @@ class SequenceHistory:
     _noises: list[float] = field(default_factory=list)
     _shown: list[Shown] = field(default_factory=list)
     _doubted: dict[tuple[int, Axis, float], list[Shown]] = field(default_factory=dict)
+    _accepted: tuple[Axis, float | None] = ("x", None)
+    _wrong: list[tuple[Axis, float | None]] = field(default_factory=list)
     _settled: set[tuple[int, Axis, float]] = field(default_factory=set)
     _last: NDArray[np.float32] | None = None
-    _latest: NDArray[np.float32] | None = None
+    latest: NDArray[np.float32] | None = None
     _former: NDArray[np.float32] | None = None
     _mean: NDArray[np.float32] | None = None
     _means: int = 0
@@ -67,7 +71,9 @@ class SequenceHistory:
     _extent: dict[Axis, int] = field(default_factory=dict)
     _known: dict[Axis, NDArray[np.float32]] = field(default_factory=dict)
     _levels: NDArray[np.float32] | None = None
-    _contradicting: list[tuple[NDArray[np.float32], NDArray[np.bool_]]] = field(default_factory=list)
+    _contradicting: list[tuple[NDArray[np.float32], NDArray[np.bool_], tuple[Axis, float | None]]] = field(
+        default_factory=list
+    )
     _unclipped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
     _frames: int = 0
 
@@ -122,10 +128,11 @@ class SequenceHistory:
     def ended(self, last: NDArray[np.float32], good: bool) -> None:
         """Take over the last frame of a sequence at the sampled pixels; of a bad one nobody knows what it shows."""
         self._last = last if good else None
-        self._former, self._latest = self._latest, last
+        self._former, self.latest = self.latest, last
 
     def accept(self, fringes: FringeSequence, waveform: Waveform, valid: NDArray[np.bool_]) -> None:
         """Take over a sequence that was found good."""
+        self._accepted = (fringes.axis, fringes.frequency)
         mean = np.where(valid, waveform.mean, np.float32(np.nan))
         if self._mean is None:
             self._mean, self._means, self._frames = mean, 1, len(fringes.fringes)
@@ -142,7 +149,14 @@ class SequenceHistory:
         if fringes.frequency is not None:
             sigma_z = waveform.sigma_dn * float(np.sqrt(2 / len(fringes.fringes)))
             shown = Shown(
-                fringes.axis, fringes.frequency, waveform.z, sigma_z, waveform.usable, self._round, self._former
+                fringes.axis,
+                fringes.frequency,
+                waveform.z,
+                sigma_z,
+                waveform.usable,
+                self._round,
+                self._former,
+                sure=free_harmonics(len(fringes.fringes)) > 1,
             )
             self._shown = [
                 s for s in self._shown if (s.axis, s.frequency, s.round) != (shown.axis, shown.frequency, shown.round)
@@ -161,6 +175,11 @@ class SequenceHistory:
             Of a frame, (H, W).
         """
         shown = [s for s in self._shown if s.round == self._round]
+        if self._wrong:
+            what = "the mean of its steps is not that of the sequences after it: a frame was stale, torn, mixed or dark"
+            found = [AtOdds(axis, frequency, what) for axis, frequency in self._wrong]
+            self._wrong = []
+            return found
         sure = standing_out(shown, self._extent, grid(shape))
         found = []
         for axis in self._extent:
@@ -180,29 +199,62 @@ class SequenceHistory:
                     break
         return found
 
-    def doubt_levels(self, waveform: Waveform, valid: NDArray[np.bool_], cells: Grid, count: int) -> bool:
-        """Whether the levels, rather than a sequence that contradicts them, are wrong: one before agreed with it."""
-        if self._mean is not None or self._levels is None:
+    def doubt_former(
+        self, fringes: FringeSequence, waveform: Waveform, valid: NDArray[np.bool_], cells: Grid, count: int
+    ) -> bool:
+        """Whether the levels, or the only sequence so far, are wrong, rather than one that has another mean.
+
+        So it is where two that were refused agree with each other. A sequence that is found wrong so counts no more for
+        the mean, and `at_odds` has it taken again.
+        """
+        if (self._mean is None and self._levels is None) or self._means > 1:
             return False
+        place = (fringes.axis, fringes.frequency)
         agreed = any(
             other_mean(waveform, Reference(mean, known, 1 / count), count, cells).max() <= 1
-            for mean, known in self._contradicting
+            for mean, known, former in self._contradicting
+            # A projector that lags for long may lag alike in two attempts at one sequence.
+            if self._mean is None or former != place
         )
-        self._contradicting.append((waveform.mean, valid & waveform.usable))
+        self._contradicting.append((waveform.mean, valid & waveform.usable, place))
+        if agreed and self._mean is not None:
+            self._mean, self._means = None, 0
+            self._wrong.append(self._accepted)
         return agreed
 
     # What the sequences before say of a new one; each returns what is wrong, in words, or "".
 
-    def begins_with_the_former(self, first: NDArray[np.float32], waveform: Waveform) -> bool:
-        """Whether the first frame is the last picture of the sequence before it, as far as their noise tells."""
+    def begins_with_the_former(
+        self,
+        values: NDArray[np.float32],
+        steps_rad: NDArray[np.float64],
+        waveform: Waveform,
+        valid: NDArray[np.bool_],
+    ) -> bool:
+        """Whether the first of (N, P) frames is the last picture of the sequence before, and should not look like it.
+
+        As far as the noise tells: on a small object, one picture may look like the other by chance.
+        """
         lit = waveform.usable & (np.abs(waveform.z) > 4 * waveform.sigma_dn)
         if self._last is None or np.count_nonzero(lit) < FEWEST:
             return False
         if not _diverse(waveform.z[lit]):
             # All in the dark of one fringe, say: there, two pictures may look alike.
             return False
-        off = float(np.sqrt(np.square(first[lit] - self._last[lit]).mean()))
-        return bool(off < _SAME_PICTURE * np.sqrt(2) * waveform.sigma_dn)
+        off = float(np.sqrt(np.square(values[0, lit] - self._last[lit]).mean()))
+        if off > _SAME_PICTURE * np.sqrt(2) * waveform.sigma_dn:
+            return False
+        # What the others, and the mean as it must be, say of the first.
+        rows, others = series(steps_rad[1:], 1), values[1:, lit]
+        reference = self.reference(values, valid)
+        if reference is not None:
+            rows, others = np.vstack([rows, [1, 0, 0]]), np.vstack([others, reference.mean[lit]])
+        if len(rows) < 3:
+            return True
+        weights = series(steps_rad[:1], 1)[0] @ np.linalg.pinv(rows)
+        noise = (1 + float(weights @ weights)) * waveform.sigma_dn**2
+        apart = float(np.square(weights @ others - self._last[lit]).mean())
+        return apart - noise > (_OTHER_PICTURE * waveform.sigma_dn) ** 2
 
     def reference(self, values: NDArray[np.float32], valid: NDArray[np.bool_]) -> Reference | None:
         """The mean A of the steps whose (N, P) ``values`` are given, as the sequences before them have it."""

@@ -202,16 +202,20 @@ def series(steps_rad: NDArray[np.float64], orders: int) -> NDArray[np.float64]:
     return np.concatenate([np.ones((len(steps_rad), 1)), np.cos(angle), -np.sin(angle)], axis=1)
 
 
+def next_harmonic(waveform: Waveform) -> float:
+    """Greatest plausible amplitude of the first harmonic that is not free, as a share of A."""
+    share, most = _NEXT_HARMONIC[free_harmonics(len(waveform.visible))]
+    return min(share * float(np.abs(waveform.distortion()[0])), most)
+
+
 def excess(waveform: Waveform, cells: Grid) -> NDArray[np.float64]:
     """(N, tiles + 1) how far each frame's error is beyond what noise and harmonics make: above 1 is an alarm."""
-    share, most = _NEXT_HARMONIC[free_harmonics(len(waveform.visible))]
     visible = np.maximum(waveform.visible, 1e-9)[:, None]
     energy, single, brightness, pixels = _energies(np.square(waveform.errors), waveform, cells)
-    next_harmonic = min(share * float(np.abs(waveform.distortion()[0])), most)
     found = beyond(
         energy=energy,
         noise=waveform.sigma_dn**2 / visible,
-        let_pass=single + next_harmonic**2 / 2 * brightness / visible**2,
+        let_pass=single + next_harmonic(waveform) ** 2 / 2 * brightness / visible**2,
         pixels=pixels,
     )
     found[waveform.visible < _LEAST_VISIBLE] = 0

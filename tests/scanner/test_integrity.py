@@ -99,3 +99,27 @@ def test_without_fringes_there_is_nothing_to_say():
     assert found.usable == 0.0
     black = np.zeros((12, *SHAPE), np.uint8)
     assert check_sequence(black, phase_steps("x", 1 / 16, 12), 255).good
+
+
+@pytest.mark.parametrize("steps", [6, 12])
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+@pytest.mark.parametrize(("ratio", "found"), [(0.3, False), (0.65, True)])
+def test_an_error_that_is_lost_in_the_noise_of_every_pixel(steps, gamma, ratio, found):
+    # (2/N) (e/B) / √2 is the rms error of the phase, √(2/N) σ/B its noise.
+    plan, frames = sequence(4, steps, 3.0, gamma)
+    frames = np.clip(
+        frames.astype(int) + np.rint(ratio * 3.0 * np.sqrt(steps)).astype(int) * (np.arange(steps) == 2)[:, None, None],
+        0,
+        255,
+    )
+    assert bool(check_sequence(frames.astype(np.uint8), plan, 255).findings) == found
+
+
+def test_a_part_of_the_former_picture_in_a_few_rows():
+    plan, frames = sequence(5, 12, 3.0)
+    former, own = frames[4, 20:28].astype(float), frames[5, 20:28]
+    rng = np.random.default_rng(1)
+    frames[5, 20:28] = np.rint(0.55 * own + 0.45 * former + rng.normal(0, 2, own.shape))
+    findings = check_sequence(frames, plan, 255).findings
+    assert findings
+    assert "rows" in findings[0].message

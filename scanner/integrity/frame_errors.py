@@ -1,0 +1,89 @@
+"""The error of one frame, told over many pixels by the forms that it can have.
+
+What no waveform explains of a frame is its error and noise. Pixel by pixel the noise hides what would move a phase by
+as much as itself. But an error has a form: light that flickers is the same everywhere, a shutter that was late goes
+with A, mostly as B does, the picture before goes with the fringe. How much of each is in a frame is known from hundreds
+of pixels, whatever bounces do to the waveform.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.integrity.sampling import Grid
+from scanner.integrity.waveform import HARMFUL, STEADY, Waveform, free_harmonics
+
+_BY_CHANCE = 1e-9
+_FEWEST_OF_BAND = 40
+_LEAST_VISIBLE = 0.05
+_ALIKE = 1e-2
+"""Share of its energy that must set a form apart from all others; where the phases are few, they are alike."""
+
+
+def formed_excess(
+    waveform: Waveform, steps_rad: NDArray[np.float64], cells: Grid, former: NDArray[np.float32] | None
+) -> NDArray[np.float64]:
+    """(N, tiles + 1) how far each frame's error is beyond what does no harm: above 1 is an alarm.
+
+    Parameters
+    ----------
+    waveform
+        Of a sequence with more frames than its waveform needs.
+    steps_rad
+        (N,) planned steps.
+    cells
+        Where the pixels lie; they are judged by bands of rows, and all together.
+    former
+        (P,) the frame that was taken before the first one, DN; None where there was none.
+    """
+    # Heavy, and not needed where the steps are few.
+    from scipy.stats import chi2
+
+    count = len(steps_rad)
+    z = waveform.z[waveform.usable].astype(np.complex128)
+    b, phase, band = np.abs(z), np.angle(z), cells.band[waveform.usable]
+    forms = np.stack([np.ones_like(b), b, z.real, z.imag], axis=1)
+    # The first harmonics that are not free: they go with the phase in all frames.
+    orders = free_harmonics(count) + np.arange(1, 3)
+    harmonics = np.concatenate([b * np.cos(np.outer(orders, phase)), b * np.sin(np.outer(orders, phase))]).T
+    found = np.zeros((count, cells.bands + 1))
+    for region in range(cells.bands + 1):
+        there = np.flatnonzero(band == region) if region < cells.bands else np.arange(b.size)
+        if there.size < _FEWEST_OF_BAND:
+            continue
+        steady = STEADY**2 * float(np.square(b[there]).mean()) / (2 * waveform.sigma_dn**2)
+        values, vectors = np.linalg.eigh(_products(harmonics[there]))
+        clear = values > _ALIKE * values[-1]
+        spoilt = _scaled(harmonics[there]) @ (vectors[:, clear] / np.sqrt(values[clear]))
+        for n in np.flatnonzero(waveform.visible >= _LEAST_VISIBLE):
+            own = forms[there]
+            if n == 0 and former is not None:
+                own = np.column_stack([own, former[waveform.usable][there]])
+            own = _scaled(own)
+            free = own - spoilt @ (spoilt.T @ own)
+            values, vectors = np.linalg.eigh(free.T @ free)
+            clear = values > _ALIKE
+            if not clear.any():
+                continue
+            along = vectors[:, clear].T @ (free.T @ waveform.errors[n, there])
+            error = own @ (vectors[:, clear] @ (along / values[clear]))
+            energy = float((along**2 / values[clear]).sum()) * waveform.visible[n] / waveform.sigma_dn**2
+            certain = energy / float(chi2.isf(_BY_CHANCE, int(clear.sum())))
+            # A phase moves by (2/N) (e/B) sin(φ + δ), its noise is √(2/N) σ/B.
+            moved = 2 / count * float(np.square(error * np.sin(phase[there] + steps_rad[n])).mean())
+            found[n, region] = min(certain, moved / waveform.sigma_dn**2 / (HARMFUL + steady))
+    # In the tiles that show most of it.
+    held = np.bincount(cells.tile[waveform.usable], minlength=cells.tiles).reshape(cells.bands, -1)
+    by_tile = (found[:, :-1, None] * (held > held.max(axis=1, keepdims=True) / 2)).reshape(count, -1)
+    return np.concatenate([by_tile, found[:, -1:]], axis=1)
+
+
+def _scaled(columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The columns, each with unit length."""
+    return np.asarray(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-9))
+
+
+def _products(columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    scaled = _scaled(columns)
+    return np.asarray(scaled.T @ scaled)
