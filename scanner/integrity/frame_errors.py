@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.integrity.sampling import Grid
-from scanner.integrity.waveform import HARMFUL, STEADY, Waveform, free_harmonics
+from scanner.integrity.waveform import HARMFUL, STEADY, Waveform, free_harmonics, next_harmonic
 
 _BY_CHANCE = 1e-9
 _FEWEST_OF_BAND = 40
@@ -47,12 +47,16 @@ def formed_excess(
     # The first harmonics that are not free: they go with the phase in all frames.
     orders = free_harmonics(count) + np.arange(1, 3)
     harmonics = np.concatenate([b * np.cos(np.outer(orders, phase)), b * np.sin(np.outer(orders, phase))]).T
+    # Where two paths of light meet they do not; there they are at most as large as the last one that is free.
+    spoiling = min(next_harmonic(waveform), float(np.abs(waveform.distortion()[-1]))) ** 2 / 2
+    level = np.maximum(waveform.mean[waveform.usable], b)
     found = np.zeros((count, cells.bands + 1))
     for region in range(cells.bands + 1):
         there = np.flatnonzero(band == region) if region < cells.bands else np.arange(b.size)
         if there.size < _FEWEST_OF_BAND:
             continue
         steady = STEADY**2 * float(np.square(b[there]).mean()) / (2 * waveform.sigma_dn**2)
+        bright = float(np.square(level[there]).mean())
         values, vectors = np.linalg.eigh(_products(harmonics[there]))
         clear = values > _ALIKE * values[-1]
         spoilt = _scaled(harmonics[there]) @ (vectors[:, clear] / np.sqrt(values[clear]))
@@ -72,7 +76,9 @@ def formed_excess(
             certain = energy / float(chi2.isf(_BY_CHANCE, int(clear.sum())))
             # A phase moves by (2/N) (e/B) sin(φ + δ), its noise is √(2/N) σ/B.
             moved = 2 / count * float(np.square(error * np.sin(phase[there] + steps_rad[n])).mean())
-            found[n, region] = min(certain, moved / waveform.sigma_dn**2 / (HARMFUL + steady))
+            harm = moved / waveform.sigma_dn**2 / (HARMFUL + steady)
+            plausible = np.square(error).mean() * waveform.visible[n] ** 2 / max(spoiling * bright, 1e-9)
+            found[n, region] = min(certain, harm, plausible)
     # In the tiles that show most of it.
     held = np.bincount(cells.tile[waveform.usable], minlength=cells.tiles).reshape(cells.bands, -1)
     by_tile = (found[:, :-1, None] * (held > held.max(axis=1, keepdims=True) / 2)).reshape(count, -1)

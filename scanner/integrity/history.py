@@ -156,7 +156,7 @@ class SequenceHistory:
                 waveform.usable,
                 self._round,
                 self._former,
-                sure=free_harmonics(len(fringes.fringes)) > 1,
+                sure=free_harmonics(len(fringes.fringes)) > (1 if found else 2),
             )
             self._shown = [
                 s for s in self._shown if (s.axis, s.frequency, s.round) != (shown.axis, shown.frequency, shown.round)

@@ -101,8 +101,7 @@ def test_without_fringes_there_is_nothing_to_say():
     assert check_sequence(black, phase_steps("x", 1 / 16, 12), 255).good
 
 
-@pytest.mark.parametrize("steps", [6, 12])
-@pytest.mark.parametrize("gamma", [1.0, 2.2])
+@pytest.mark.parametrize(("steps", "gamma"), [(6, 1.0), (12, 1.0), (12, 2.2)])
 @pytest.mark.parametrize(("ratio", "found"), [(0.3, False), (0.65, True)])
 def test_an_error_that_is_lost_in_the_noise_of_every_pixel(steps, gamma, ratio, found):
     # (2/N) (e/B) / √2 is the rms error of the phase, √(2/N) σ/B its noise.
