@@ -216,7 +216,7 @@ def plan(
     from rich.console import Console
 
     from scanner.design import Demand
-    from scanner.folder import ComparisonFolder
+    from scanner.folder import DESIGNED_PLAN, PlanFolder
     from scanner.studies.reports import design_study, plan_rows
     from scanner.terminal import plan_table
 
@@ -237,10 +237,10 @@ def plan(
     if out is None:
         chosen, usual, plans = design_study(demand, None)
     else:
-        with ComparisonFolder(out, overwrite=overwrite) as folder:
+        with PlanFolder(out, overwrite=overwrite) as folder:
             chosen, usual, plans = design_study(demand, folder.path)
             folder.write_json(
-                "plan.json",
+                DESIGNED_PLAN,
                 {"chosen": plan_rows([chosen])[0], "paper": plan_rows([usual])[0], "trade": plan_rows(plans)},
             )
     console = Console(highlight=False, soft_wrap=True)
@@ -259,15 +259,15 @@ def study_detection(
     quiet: QuietOption = False,
 ) -> None:
     """Detection at the limit: the paper's α × σ study with three detectors, over all Δu, with intervals."""
-    from scanner.folder import ComparisonFolder
+    from scanner.folder import DETECTION_STUDY, StudyFolder
     from scanner.studies.reports import detection_study
     from scanner.terminal import Terminal
 
     terminal = Terminal(quiet)
-    with ComparisonFolder(out or _default_out("study"), overwrite=overwrite) as folder:
+    with StudyFolder(out or _default_out("study"), overwrite=overwrite) as folder:
         with terminal.working() as report:
             document = detection_study(folder.path, seeds, _axes(axes), fast, report)
-        folder.write_json("detection.json", document)
+        folder.write_json(DETECTION_STUDY, document)
     terminal.detection_study(document, folder.out)
 
 

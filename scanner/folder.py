@@ -30,7 +30,7 @@ from scanner.rig import Rig
 from scanner.take import FRAMES
 
 RESULT = "result.json"
-COMPARISON = "comparison.json"
+COMPARISON, DETECTION_STUDY, DESIGNED_PLAN = "comparison.json", "detection.json", "plan.json"
 MAPS, CLOUD, REPORT, RIG, CONFIG, TAKE = "maps.npz", "cloud.ply", "report.html", "rig.json", "config.yaml", "take"
 
 _FORMAT, _VERSION = "mfs-scanner result", 1
@@ -214,14 +214,30 @@ class ResultFolder(OutputFolder):
             shutil.rmtree(self.path / TAKE, ignore_errors=True)
 
 
-class ComparisonFolder(OutputFolder):
-    """The folder of a comparison: a result folder for each method, and what was found."""
-
-    marker = COMPARISON
+class DocumentFolder(OutputFolder):
+    """A folder whose document says what was found."""
 
     def write_json(self, name: str, document: Mapping[str, Any]) -> None:
         """Write a JSON-ready document; NaN becomes null."""
         _write_text(self.path / name, _json(document))
+
+
+class ComparisonFolder(DocumentFolder):
+    """The folder of a comparison: a result folder for each method, and what was found."""
+
+    marker = COMPARISON
+
+
+class StudyFolder(DocumentFolder):
+    """The folder of a study of detection."""
+
+    marker = DETECTION_STUDY
+
+
+class PlanFolder(DocumentFolder):
+    """The folder of a designed plan."""
+
+    marker = DESIGNED_PLAN
 
 
 def write_result(

@@ -15,7 +15,16 @@ import pytest
 
 import scanner.folder
 from drivers import OperatorError
-from scanner.folder import ComparisonFolder, OutputError, OutputFolder, ResultFolder, read_result, write_result
+from scanner.folder import (
+    ComparisonFolder,
+    OutputError,
+    OutputFolder,
+    PlanFolder,
+    ResultFolder,
+    StudyFolder,
+    read_result,
+    write_result,
+)
 from scanner.patterns import Plan, phase_steps
 from scanner.result import Flag, Maps, ScanResult
 from scanner.rig import Lens, Rig
@@ -495,6 +504,17 @@ def test_comparison_holds_results(tmp_path: Path) -> None:
     with ComparisonFolder(out, overwrite=True) as folder:
         folder.write_json("comparison.json", {})
     assert (tmp_path / "compared.previous" / "mfs" / "take").is_dir()
+
+
+@pytest.mark.parametrize("kind", [StudyFolder, PlanFolder])
+def test_documents_replace_their_own_kind_only(tmp_path: Path, kind: type[OutputFolder]) -> None:
+    out = tmp_path / "found"
+    for number in range(2):
+        with kind(out, overwrite=number > 0) as folder:
+            folder.write_json(kind.marker, {"number": number})
+    assert json.loads((out / kind.marker).read_text()) == {"number": 1}
+    with pytest.raises(OutputError, match="but other files"), ComparisonFolder(out, overwrite=True):
+        pytest.fail("it is no comparison")
 
 
 def test_interrupted_comparison_keeps_every_recording(tmp_path: Path) -> None:
