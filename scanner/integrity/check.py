@@ -73,7 +73,7 @@ def check_sequence(
         frequency, only repeated frames are found.
     """
     if history and (isinstance(planned, ProfileSequence) or planned.carrier is not None):
-        history.ended(np.empty(0, np.float32), good=False)
+        history.ended(grid(frames.shape[1:]).take_all(frames[-1:])[0], good=False)
         history = None
     count = len(planned)
     findings = [
