@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import Bench, Clock, FrameFormat, FrameStamp, HardwareError, NoiseModel, Pixels
+from drivers.latency import KeepStep
 from scanner.acquisition import Acquisition, Listener
 from scanner.config import ScanSection
 from scanner.decoding import Decoder
@@ -156,6 +158,31 @@ def recorded(bench: Bench, path: Path, occasion: Occasion, slots: int) -> Iterat
         path, frame_format=bench.frame_format, slots=slots, manifest=manifest, clock=bench.clock
     ) as take:
         yield RecordingBench(bench, take)
+
+
+@contextmanager
+def recorded_steps(bench: Bench, path: Path, occasion: Occasion, slots: int) -> Iterator[KeepStep]:
+    """Record the frames of steps between black and white; each step is a round of its own, as long as it took.
+
+    Parameters
+    ----------
+    bench, path, occasion, slots
+        As for `recorded`.
+    """
+    manifest = occasion.manifest(bench, "pictures", [])
+    with TakeWriter.create(
+        path, frame_format=bench.frame_format, slots=slots, manifest=manifest, clock=bench.clock
+    ) as take:
+        rounds = count(1)
+
+        def keep(level: int, frames: Sequence[tuple[Pixels, FrameStamp]]) -> None:
+            number = next(rounds)
+            take.begin_round(number, {"sequences": [{"fringes": [{"level": level}] * len(frames)}]})
+            for index, (pixels, stamp) in enumerate(frames):
+                take.write_frame(number, 0, 1, index, pixels, stamp)
+            take.commit_sequence(number, 0, 1)
+
+        yield keep
 
 
 def capture_fringes(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from drivers.devices import Clock, FrameFormat, FrameStamp, NoiseModel, Pixels
-from drivers.latency import DisplayLatency
+from drivers.latency import DisplayLatency, KeepStep
 
 
 @runtime_checkable
@@ -176,6 +176,8 @@ class LatencyBound(Protocol):
         """
         ...
 
-    def measure_latency(self, progress: Callable[[int, int], None]) -> DisplayLatency:
-        """Measure it with the bench's own camera; ``progress`` is called with (done, total)."""
+    def measure_latency(
+        self, progress: Callable[[int, int], None], keep: KeepStep = lambda level, frames: None
+    ) -> DisplayLatency:
+        """Measure it with the bench's own camera; see `drivers.latency.measure_latency`."""
         ...

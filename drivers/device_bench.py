@@ -33,7 +33,7 @@ from drivers.errors import (
     OperatorError,
     SequenceFaultError,
 )
-from drivers.latency import DisplayLatency, measure_latency
+from drivers.latency import DisplayLatency, KeepStep, measure_latency
 
 _RETRY_S = 0.5
 
@@ -133,7 +133,9 @@ class DeviceBench:
                 )
             self.settle_s = latency.settle_s(self.projector.period_s)
 
-    def measure_latency(self, progress: Callable[[int, int], None]) -> DisplayLatency:
+    def measure_latency(
+        self, progress: Callable[[int, int], None], keep: KeepStep = lambda level, frames: None
+    ) -> DisplayLatency:
         """Measure the display's latency with this bench's camera; see `drivers.latency.measure_latency`."""
         return measure_latency(
             self.camera,
@@ -144,6 +146,7 @@ class DeviceBench:
             frame_format=self.frame_format,
             exposure_s=self.exposure_s,
             progress=progress,
+            keep=keep,
         )
 
     def prepare(self, patterns: Sequence[NDArray[np.uint8]]) -> None:

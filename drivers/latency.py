@@ -7,7 +7,7 @@ frames; the frame that saw part of the step says when it came.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any, Self
@@ -15,11 +15,14 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.devices import Camera, Clock, FrameFormat, Projector, Trigger
+from drivers.devices import Camera, Clock, FrameFormat, FrameStamp, Pixels, Projector, Trigger
 from drivers.errors import DeviceSettingError, HardwareError
 
 STEPS = 50
 _PATIENCE_S = 2.0
+
+KeepStep = Callable[[int, Sequence[tuple[Pixels, FrameStamp]]], None]
+"""Is given the level a step went to (0 or 255) and every frame taken of it, which it must not hold on to."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,7 @@ def measure_latency(
     exposure_s: float,
     steps: int = STEPS,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    keep: KeepStep = lambda level, frames: None,
 ) -> DisplayLatency:
     """Measure the latency of a display with running devices (camera started, projector configured).
 
@@ -104,6 +108,8 @@ def measure_latency(
         How many, black to white and back in turn.
     progress
         Called with (steps done, steps in all).
+    keep
+        Called after each step, so that writing its frames down does not delay them.
 
     Returns
     -------
@@ -119,13 +125,17 @@ def measure_latency(
     projector.load([np.zeros((height, width), np.uint8), np.full((height, width), 255, np.uint8)])
     if trigger is not None:
         trigger.arm()
-    frame = np.empty(frame_format.shape, frame_format.dtype)
+    buffers: list[Pixels] = []
+    taken: list[tuple[Pixels, FrameStamp]] = []
 
     earliest = clock.now()
 
     def photograph() -> float:
-        """Time of the trigger, s; the frame is in ``frame``."""
+        """Time of the trigger, s; the frame is the last of ``taken``."""
         nonlocal earliest
+        if len(taken) == len(buffers):
+            buffers.append(np.empty(frame_format.shape, frame_format.dtype))
+        frame = buffers[len(taken)]
         clock.sleep(earliest - clock.now())
         asked = clock.now()
         if trigger is None:
@@ -133,15 +143,20 @@ def measure_latency(
         else:
             trigger.fire()
             earliest = clock.now() + trigger.min_period_s
-        camera.fetch(frame, exposure_s + _PATIENCE_S)
+        taken.append((frame, camera.fetch(frame, exposure_s + _PATIENCE_S)))
         return asked
+
+    def end_step(level: int) -> None:
+        keep(level, taken)
+        taken.clear()
 
     levels = []
     for picture in (0, 1):
         projector.show(picture)
         clock.sleep(_PATIENCE_S / 2)
         photograph()
-        levels.append(frame.astype(np.float32))
+        levels.append(taken[-1][0].astype(np.float32))
+        end_step(255 * picture)
     seen = _brightened(levels[0], levels[1])
     dark, bright = (float(level[seen].mean()) for level in levels)
 
@@ -153,7 +168,7 @@ def measure_latency(
         shown = projector.show(int(white))
         while True:
             asked = photograph()
-            share = (float(frame[seen].mean()) - dark) / (bright - dark)
+            share = (float(taken[-1][0][seen].mean()) - dark) / (bright - dark)
             arrived = share if white else 1 - share
             if arrived > 0.05:
                 # With all of the exposure in the new light the step came no later than its beginning.
@@ -166,6 +181,7 @@ def measure_latency(
                     "Check that the projector shows this computer's picture, and that nothing else is on its screen.",
                 )
         clock.sleep(projector.period_s)
+        end_step(255 * int(white))
         progress(done + 1, steps)
     return DisplayLatency(
         median_s=float(np.median(latencies)),

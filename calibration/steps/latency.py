@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.capture import recorded
+from calibration.capture import recorded, recorded_steps
 from calibration.display import check_display
 from calibration.guide.guidance import Curve, Step
 from calibration.work import Work
 from drivers import LatencyBound
+from drivers.latency import STEPS
 
 STEP: Step = "latency"
 
@@ -31,8 +32,9 @@ def run(work: Work) -> None:
             "Hold the board still in the middle of the volume; the light will flash.",
         )
         if isinstance(bench, LatencyBound):
-            with work.counting("latency: step") as count:
-                latency = bench.measure_latency(count)
+            place, occasion = work.folder.new_take(f"{STEP}-steps"), work.occasion(STEP)
+            with recorded_steps(bench, place, occasion, 3 * STEPS) as keep, work.counting("latency: step") as count:
+                latency = bench.measure_latency(count, keep)
             document = latency.to_json()
             lines.append(
                 f"from hand-over to surface {latency.median_s * 1e3:.1f} ms (median), {latency.p99_s * 1e3:.1f} ms "

@@ -54,7 +54,7 @@ def test_folder_holds_what_was_found_and_the_recordings(calibrated):
     folder = calibrated.folder
     assert list(read_steps(folder)["steps"]) == STEPS
     takes = {place.name: Take.open(place).status for place in (folder / "takes").iterdir()}
-    assert {"focus", "exposure-01", "latency", "response-ramp", "pose-01", "pose-05"} <= set(takes)
+    assert {"focus", "exposure-01", "latency-steps", "latency", "response-ramp", "pose-01", "pose-05"} <= set(takes)
     assert set(takes.values()) == {"completed"}
     opened = Rig.load(folder / OPENCV_RIG)
     np.testing.assert_allclose(opened.camera.matrix, Rig.load(folder / RIG).camera.matrix)
@@ -89,7 +89,7 @@ def interrupt_at(monkeypatch):
 
     def writing(take, *args, **kwargs):
         write(take, *args, **kwargs)
-        if wanted[0] and wanted[0] in str(take.path):
+        if wanted[0] and wanted[0] in f"{take.path}/":
             wanted[0] = ""
             signal.raise_signal(signal.SIGINT)
 
@@ -106,7 +106,8 @@ def test_interrupted_in_every_step_it_goes_on(bench_file, tmp_path, interrupt_at
     places = [
         "focus",
         "exposure-01",
-        "latency",
+        "latency-steps",
+        "latency/",
         "response-ramp",
         "response-frequencies",
         "pose-01",
@@ -120,7 +121,7 @@ def test_interrupted_in_every_step_it_goes_on(bench_file, tmp_path, interrupt_at
         assert "interrupted" in ran.err
         assert "goes on from here" in ran.err
         done = list(read_steps(folder)["steps"])
-        step = place.split("-")[0].replace("pose", "geometry").replace("01", "acceptance")
+        step = place.strip("/").split("-")[0].replace("pose", "geometry").replace("01", "acceptance")
         assert done == STEPS[: STEPS.index(step)], place
         if place == "pose-04":
             assert len(list((folder / "poses").glob("pose-*.npz"))) == 2, "poses so far are kept"
@@ -129,7 +130,8 @@ def test_interrupted_in_every_step_it_goes_on(bench_file, tmp_path, interrupt_at
     cut_off = {place.name for place in (folder / "takes").glob("*.cut-off")}
     # A number of a pose is never used twice, so that a cut-off one keeps its name.
     assert cut_off == {
-        f"{name}.cut-off" for name in ("focus", "exposure-01", "latency", "response-ramp", "response-frequencies")
+        f"{name}.cut-off"
+        for name in ("focus", "exposure-01", "latency-steps", "latency", "response-ramp", "response-frequencies")
     }
     for place in (folder / "takes").iterdir():
         is_whole = place.name not in cut_off and place.name not in ("pose-01", "pose-04")

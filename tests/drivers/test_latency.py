@@ -69,6 +69,26 @@ def test_latency_is_that_of_the_projector(latency_s):
     assert found.settle_s(projector.period_s) > true.max() + 0.9 * projector.period_s
 
 
+def test_every_frame_of_every_step_is_kept_and_shows_it():
+    camera, projector, clock, frame_format = devices(0.035)
+    kept = []
+
+    def keep(level, frames):
+        kept.append((level, [stamp.frame_id for _, stamp in frames], [float(pixels.mean()) for pixels, _ in frames]))
+
+    measure_latency(
+        camera, projector, clock, np.random.default_rng(2), frame_format=frame_format,
+        exposure_s=EXPOSURE_S, steps=6, keep=keep,
+    )  # fmt: skip
+    assert [level for level, _, _ in kept] == [0, 255, 0, 255, 0, 255, 0, 255]
+    numbers = [number for _, ids, _ in kept for number in ids]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), "none is left out"
+    for level, _, means in kept[2:]:
+        # 35 ms are longer than an exposure and its read-out, so that the first still sees what was there before.
+        assert abs(means[0] - (20 if level else 170)) < 1
+        assert abs(means[-1] - means[0]) > 0.05 * 150
+
+
 def test_camera_that_sees_no_projector_is_told(array_bench):
     camera, projector, clock, frame_format = devices(0.03, Wall(contrast=1.0))
     with pytest.raises(HardwareError, match="no difference between black and white"):
