@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,9 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_configure(config):
+    # A shell that starts the tests in the background has them ignore Ctrl-C, and with them all they start.
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     # The suites look for their subjects while tests are collected.
     if config.getoption("--hardware"):
         os.environ["MFS_SCANNER_HARDWARE"] = str(Path(config.getoption("--hardware")).resolve())
