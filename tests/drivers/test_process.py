@@ -143,11 +143,14 @@ def test_the_terminals_interrupt_does_not_reach_it(echo):
 
 
 def test_the_answer_to_an_interrupted_call_is_not_taken_for_the_next(echo):
+    def interrupted_call():
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        echo.call("hang", 0.4)
+
     signal.signal(signal.SIGALRM, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
-            signal.setitimer(signal.ITIMER_REAL, 0.1)
-            echo.call("hang", 0.4)
+            interrupted_call()
     finally:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
     assert echo.call("greet", "you").startswith("hello you")
