@@ -25,8 +25,8 @@ def pytest_addoption(parser):
 
 HERE = Path(__file__).parent
 ALONE = (
-    "calibration/test_guide", "calibration/test_person", "calibration/test_wizard", "conformance", "drivers",
-    "scanner/test_cli", "scanner/test_doctor", "scanner/test_preview", "scanner/test_take", "sim_backend/gentl",
+    "conformance", "drivers",
+    "scanner/test_cli_interrupted", "scanner/test_preview", "sim_backend/gentl",
     "sim_backend/test_trigger_box", "sim_backend/test_world", "sim_backend/test_xserver", "test_virtual",
 )  # fmt: skip
 """Where tests live on real time, windows or processes of their own: they have the machine to themselves."""
