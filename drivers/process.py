@@ -20,6 +20,9 @@ from typing import Any, Protocol
 
 from drivers.errors import DeviceLostError, HardwareError, OperatorError
 
+_REAPED_WITHIN_S = 5.0
+"""A process that has let go of its pipes is about to end; how soon it can be asked why, a busy machine decides."""
+
 Emit = Callable[[Any], None]
 """Sends one message (picklable) from the server to `DeviceProcess.next_event`."""
 
@@ -183,7 +186,7 @@ class DeviceProcess:
     def _died(self) -> DeviceLostError:
         code = None
         if self._process is not None:
-            self._process.join(1.0)
+            self._process.join(_REAPED_WITHIN_S)
             code = self._process.exitcode
         if code is not None and code < 0:
             why = f"its process was ended by {signal.Signals(-code).name}"

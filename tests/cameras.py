@@ -99,13 +99,13 @@ class NumberedPictures:
         return exposure_picture(shape, request.bits, request.frame_id).astype(dtype)
 
 
-def shot(camera, out, timeout_s=2.0):
+def shot(camera, out, timeout_s=10.0):
     """Trigger and fetch; returns the stamp."""
     camera.trigger()
     return camera.fetch(out, timeout_s)
 
 
-def shot_until_fault(camera, out, timeout_s=2.0):
+def shot_until_fault(camera, out, timeout_s=10.0):
     """Trigger and fetch until a fault shows: one that was injected reaches the camera a moment later.
 
     Returns the stamp of the last good frame and the error.
@@ -124,7 +124,7 @@ def counters(camera):
     return camera.describe()["counters"]
 
 
-def wait_for(condition, within_s=5.0):
+def wait_for(condition, within_s=20.0):
     """Wait until the condition holds; fails the test where it does not."""
     deadline = time.monotonic() + within_s
     while not condition():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,8 @@ def pytest_addoption(parser):
 
 HERE = Path(__file__).parent
 ALONE = (
-    "calibration/test_guide", "calibration/test_person", "calibration/test_wizard", "conformance", "drivers",
-    "scanner/test_cli", "scanner/test_doctor", "scanner/test_preview", "scanner/test_take", "sim_backend/gentl",
+    "conformance", "drivers",
+    "scanner/test_cli_interrupted", "scanner/test_preview", "sim_backend/gentl",
     "sim_backend/test_trigger_box", "sim_backend/test_world", "sim_backend/test_xserver", "test_virtual",
 )  # fmt: skip
 """Where tests live on real time, windows or processes of their own: they have the machine to themselves."""
@@ -38,6 +39,9 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_configure(config):
+    # A shell that starts the tests in the background has them ignore Ctrl-C, and with them all they start.
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     # The suites look for their subjects while tests are collected.
     if config.getoption("--hardware"):
         os.environ["MFS_SCANNER_HARDWARE"] = str(Path(config.getoption("--hardware")).resolve())

@@ -64,13 +64,13 @@ def next_frame(acquirer, timeout=2.0):
         return buffer.module.frame_id, buffer.timestamp_ns, picture
 
 
-def shoot(acquirer, timeout=2.0):
+def shoot(acquirer, timeout=20.0):
     """Trigger a frame and fetch it."""
     acquirer.remote_device.node_map.TriggerSoftware.execute()
     return next_frame(acquirer, timeout)
 
 
-def wait_for(condition, timeout=2.0):
+def wait_for(condition, timeout=20.0):
     deadline = time.monotonic() + timeout
     while not condition():
         assert time.monotonic() < deadline
@@ -111,7 +111,7 @@ IN_ANOTHER_PROCESS = """
         getattr(nodes, sys.argv[2]).value = 2
         for _ in range(2):
             nodes.TriggerSoftware.execute()
-            with acquirer.fetch(timeout=2.0) as buffer:
+            with acquirer.fetch(timeout=20.0) as buffer:
                 print(buffer.module.frame_id, flush=True)
     sys.stdin.read()
 """

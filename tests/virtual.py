@@ -45,7 +45,7 @@ def all_photographed(bench, patterns):
     return [frame for frame, _ in pairs], [stamp for _, stamp in pairs]
 
 
-def sequence(bench, patterns, attempts=5):
+def sequence(bench, patterns, attempts=30):
     """Frames and stamps of one good sequence; a busy machine may cost an attempt, as in a scan."""
     for attempt in range(attempts):
         try:

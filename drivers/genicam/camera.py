@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from drivers.clock import ahead_of_monotonic
 from drivers.devices import Clock, DeviceState, FrameFormat, FrameStamp, Lifecycle, NoiseModel, Pixels
 from drivers.errors import DeviceLostError, DeviceSettingError, FrameLossError, OperatorError
 from drivers.genicam.discovery import choose, discover
@@ -193,8 +193,8 @@ class GenICamCamera:
                 "The sequence is to be taken again; where this happens often, check the cable, the bandwidth and "
                 "`buffers`.",
             )
-        age_s = time.monotonic() - arrival.t_host_s
-        return FrameStamp(arrival.frame_id, arrival.t_device_s, self._clock.now() - age_s)
+        t_host_s = arrival.t_host_s + ahead_of_monotonic(self._clock)
+        return FrameStamp(arrival.frame_id, arrival.t_device_s, t_host_s)
 
     def stop(self) -> None:
         """No more triggers; frames that nobody has fetched are dropped."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.clock import ahead_of_monotonic
 from drivers.devices import Clock, DeviceState, Lifecycle, PlayRecord
 from drivers.errors import (
     DeviceLostError,
@@ -214,7 +215,7 @@ class WindowProjector:
         flipped, late = self._call("show", index)
         self._counts["shown"] += 1
         self._counts["late"] += late
-        return self._on_bench_clock(flipped)
+        return float(flipped) + ahead_of_monotonic(self._clock)
 
     def verify(self) -> None:
         """Raise whatever has kept a picture off the surface up to now; worth a call after the last exposure.
@@ -276,7 +277,8 @@ class WindowProjector:
             shown, late = rest
             self._counts["played"] += len(shown)
             self._counts["late"] += len(late)
-            return PlayRecord(tuple(map(self._on_bench_clock, shown)), late)
+            ahead_s = ahead_of_monotonic(self._clock)
+            return PlayRecord(tuple(t + ahead_s for t in shown), late)
 
     def darken(self) -> None:
         """Show black and end a playing sequence; where the window is gone, there is nothing left to light."""
@@ -389,9 +391,6 @@ class WindowProjector:
             error.message,
             "Start the scan again; if this comes back, check the graphics driver (glxinfo -B) and the X server's log.",
         )
-
-    def _on_bench_clock(self, monotonic_s: float) -> float:
-        return monotonic_s + (self._clock.now() - time.monotonic())
 
 
 def _batches(patterns: Sequence[NDArray[np.uint8]], room: int) -> list[list[NDArray[np.uint8]]]:

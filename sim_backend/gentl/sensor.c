@@ -119,11 +119,12 @@ void sensor_start(struct camera *camera) {
     camera->frames_left = mode == CONTINUOUS     ? -1
                           : mode == SINGLE_FRAME ? 1
                                                  : register_integer(camera, REG_ACQUISITION_FRAME_COUNT);
-    camera->next_id = camera->id_shift = 0;
+    camera->id_shift = 0;
     camera->next_free_run_ns = clock_now();
     camera->latest = (struct exposure){0};
     register_set(camera, REG_TRIGGERS_IGNORED, 0);
     camera->stale_due = befalls(camera, FAULT_STALE);
+    camera->next_id = camera->stale_due ? 1 : 0; /* the first number is that of the stale frame, whenever it goes out */
 }
 
 void sensor_stop(struct camera *camera) { camera->acquiring = false; }
@@ -143,7 +144,7 @@ static struct frame frame_of(const struct exposure *exposure) {
 
 static void deliver_stale(struct camera *camera) {
     struct exposure exposure = camera->former_exposure;
-    exposure.id = camera->next_id++;
+    exposure.id = 0;
     struct frame frame = frame_of(&exposure);
     if (picture_raw_size(&exposure) == camera->raw_size)
         stream_put(&camera->stream, &frame, camera->former);

@@ -168,7 +168,7 @@ def test_without_a_trigger_there_is_no_frame(ready):
     began = time.monotonic()
     with pytest.raises(FrameTimeoutError, match=r"0\.2 s") as caught:
         camera.fetch(out, 0.2)
-    assert time.monotonic() - began < 1.5
+    assert time.monotonic() - began < 5.0
     assert camera.name in caught.value.message
     assert caught.value.remedy
     assert shot(camera, out).frame_id >= 0

@@ -40,12 +40,12 @@ def test_a_probe_that_hangs_is_left_alone_and_what_it_found_is_kept():
         over.wait(30)
 
     began = time.monotonic()
-    found = list(doctor._within(0.3, "lamps", probe))
-    assert time.monotonic() - began < 2
+    found = list(doctor._within(1.0, "lamps", probe))
+    assert time.monotonic() - began < 20
     over.set()
     assert [f.item for f in found] == ["one", "search"]
     assert found[1].verdict is Verdict.WARNING
-    assert "within 0.3 s" in found[1].text
+    assert "within 1 s" in found[1].text
 
 
 @pytest.mark.parametrize(

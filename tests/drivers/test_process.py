@@ -1,5 +1,6 @@
 """A device in a process of its own: what becomes of it when it, or this program, does not behave."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -34,13 +35,14 @@ def echo(standing):
     return standing
 
 
-def gone(pid, within_s=5.0):
+def gone(pid, within_s=20.0):
     """Whether the process ends in time."""
     deadline = time.monotonic() + within_s
-    while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.02)
+    with contextlib.suppress(psutil.NoSuchProcess):
+        while psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.02)
     return True
 
 
@@ -85,9 +87,14 @@ def test_errors_travel_with_their_kind_and_remedy(echo):
 
 
 def test_it_is_idle_between_commands(echo):
-    before = echo.call("ticks")
-    time.sleep(0.1)
-    assert echo.call("ticks") - before > 5
+    ticks = 0
+    for seconds in (0.1, 0.4, 1.6, 6.4):  # a busy machine may give it no processor at first
+        before = echo.call("ticks")
+        time.sleep(seconds)
+        ticks = echo.call("ticks") - before
+        if ticks > 5:
+            break
+    assert ticks > 5
 
 
 def test_a_crash_is_named_by_its_signal(echo):
@@ -136,11 +143,14 @@ def test_the_terminals_interrupt_does_not_reach_it(echo):
 
 
 def test_the_answer_to_an_interrupted_call_is_not_taken_for_the_next(echo):
+    def interrupted_call():
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        echo.call("hang", 0.4)
+
     signal.signal(signal.SIGALRM, signal.default_int_handler)
-    signal.setitimer(signal.ITIMER_REAL, 0.1)
     try:
         with pytest.raises(KeyboardInterrupt):
-            echo.call("hang", 0.4)
+            interrupted_call()
     finally:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
     assert echo.call("greet", "you").startswith("hello you")
@@ -191,7 +201,7 @@ def test_what_cannot_be_closed_is_killed():
     pid = process.pid
     began = time.monotonic()
     process.stop(timeout_s=0.3)
-    assert time.monotonic() - began < 3.0
+    assert time.monotonic() - began < 30.0, "half of what it would take by itself"
     assert gone(pid)
 
 

@@ -18,7 +18,10 @@ from drivers import (
 from drivers.trigger_box import PrawnBlasterBox, PrawnBlasterSettings, SerialPort
 from sim_backend.trigger_box import PrawnBlasterEmulator, SltBoxEmulator
 
-QUICK = {"reply_timeout_s": 0.1, "boot_timeout_s": 0.3}
+QUICK = {"reply_timeout_s": 0.3, "boot_timeout_s": 0.9}
+"""Where an answer does not come."""
+PATIENT = {"reply_timeout_s": 3.0, "boot_timeout_s": 10.0}
+"""Where it does, as soon as the machine lets the emulator say it."""
 
 
 @pytest.fixture
@@ -32,7 +35,7 @@ def armed(emulator):
     drivers = []
 
     def arm(pulses=None, **settings):
-        driver = PrawnBlasterBox(PrawnBlasterSettings(port=emulator.port, **(QUICK | settings)), SystemClock())
+        driver = PrawnBlasterBox(PrawnBlasterSettings(port=emulator.port, **(PATIENT | settings)), SystemClock())
         drivers.append(driver)
         driver.open()
         driver.configure()
@@ -113,7 +116,7 @@ def test_more_edges_than_the_firmware_can_await(armed):
 
 @pytest.mark.parametrize("call", ["fire", "counts", "stop"])
 def test_silent_in_mid_run(armed, emulator, call):
-    driver = armed(5 if call == "counts" else None)
+    driver = armed(5 if call == "counts" else None, **QUICK)
     emulator.faults.silent = True
     with pytest.raises(DeviceLostError, match="does not answer") as caught:
         getattr(driver, call)()
@@ -136,7 +139,7 @@ def test_garbled(armed, emulator):
 
 @pytest.mark.parametrize("fault", ["garble_replies", "halve_replies", "swallow_commands", "repeat_replies"])
 def test_one_fault_in_a_question_is_got_over(armed, emulator, fault):
-    driver = armed(5)
+    driver = armed(5, **QUICK)
     setattr(emulator.faults, fault, 1)
     assert driver.counts().sent == 0
     assert driver.state is DeviceState.ARMED

@@ -1,11 +1,11 @@
 """The projector window under Xvfb; what it shows is read from the X server's own frame buffer."""
 
 import json
-import os
 import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -66,7 +66,11 @@ def codes(count):
 
 
 class Sampler:
-    """Looks at some pixels of the surface a thousand times a second; ``runs`` is what it has seen, each change once."""
+    """Looks at some pixels of the surface a thousand times a second; ``runs`` is what it has seen, each change once.
+
+    ``times`` says when each was first seen, ``former`` when the one before was last seen; ``longest_s`` is the longest
+    time it did not look, since the machine did something else.
+    """
 
     def __init__(self, server, *pixels):
         self._views = [server.channel()[y, x : x + 1] for x, y in pixels]
@@ -74,13 +78,21 @@ class Sampler:
         self._thread = threading.Thread(target=self._look)
         self.runs = []
         self.times = []
+        self.former = []
+        self.longest_s = 0.0
 
     def _look(self):
+        last = time.monotonic()
         while not self._stop.wait(1e-3):
+            before = time.monotonic()
             seen = tuple(int(view[0]) for view in self._views)
+            after = time.monotonic()
             if not self.runs or seen != self.runs[-1]:
                 self.runs.append(seen)
-                self.times.append(time.monotonic())
+                self.times.append(after)
+                self.former.append(last)
+            self.longest_s = max(self.longest_s, after - last)
+            last = before
 
     def __enter__(self):
         self._thread.start()
@@ -90,6 +102,18 @@ class Sampler:
         time.sleep(0.02)
         self._stop.set()
         self._thread.join()
+
+
+def played_under_watch(device, server, *pixels):
+    """Play what is loaded, again where the machine was too busy for a look at each picture; (record, sampler)."""
+    for _ in range(10):
+        with Sampler(server, *pixels) as sampler:
+            device.play()
+            record = device.finish(20.0)
+        if sampler.longest_s < device.period_s - 0.01:
+            return record, sampler
+        device.darken()
+    raise AssertionError("this machine is never quiet for as long as a sequence takes")
 
 
 def test_every_pixel_after_many_shows(window, server):
@@ -165,21 +189,20 @@ def test_one_channel_lights_no_other(window, server, lit):
 
 def test_plays_each_picture_once_in_order_at_the_times_it_says(window, server):
     device = window(**HELD)
-    device.load(codes(40))
-    with Sampler(server, (0, 0), (SIZE[0] - 1, SIZE[1] - 1)) as sampler:
-        device.play()
-        record = device.finish(10.0)
-    assert len(record.shown_s) == 40
+    device.load(codes(20))
+    record, sampler = played_under_watch(device, server, (0, 0), (SIZE[0] - 1, SIZE[1] - 1))
+    assert len(record.shown_s) == 20
     for corner in (0, 1):
         seen = [run[corner] for run in sampler.runs]
         changes = [value for value, former in zip(seen[1:], seen, strict=False) if value != former]
-        assert changes == list(range(1, 41))
-    changed_s = [moment for moment, run in zip(sampler.times, sampler.runs, strict=True) if run[0] == run[1] != 0]
-    # The server copies before the swap is reported; others share the machine.
-    apart = np.array(record.shown_s) - 1000.0 - np.array(changed_s)
-    assert abs(np.median(apart)) < 5e-3
+        assert changes == list(range(1, 21))
+    both = np.array([run[0] == run[1] != 0 for run in sampler.runs])
+    shown_s = np.array(record.shown_s) - 1000.0
+    # The server copies before the swap is reported, soon before; others share the machine.
+    assert (shown_s > np.array(sampler.former)[both]).all()
+    assert np.median(shown_s - np.array(sampler.times)[both]) < 5e-3
     # Flips are at the multiples of a refresh, plus the phase.
-    assert np.median(np.mod(np.array(record.shown_s) - 1000.0 - 0.005, 1 / 50)) < 8e-3
+    assert np.median(np.mod(shown_s - 0.005, 1 / 50)) < 8e-3
 
 
 def test_holds_pictures_and_toggles_the_patch(window, server):
@@ -187,9 +210,7 @@ def test_holds_pictures_and_toggles_the_patch(window, server):
     device.load([np.full((SIZE[1], SIZE[0]), value, np.uint8) for value in (50, 50, 60, 60, 70)])
     assert device.period_s == pytest.approx(0.06)
     assert device.refresh_s == pytest.approx(0.02)
-    with Sampler(server, (0, 0), (100, 10)) as sampler:
-        device.play()
-        record = device.finish(5.0)
+    record, sampler = played_under_watch(device, server, (0, 0), (100, 10))
     # Back to black at the end, so that the next sequence begins with a rising edge again.
     assert sampler.runs[-6:] == [(50, 255), (50, 0), (60, 255), (60, 0), (70, 255), (70, 0)]
     assert (np.diff(record.shown_s) > 0.04).all()
@@ -204,9 +225,8 @@ def test_holds_pictures_and_toggles_the_patch(window, server):
 
 def test_long_sequences_pass_through_a_small_memory(window, server, monkeypatch):
     monkeypatch.setattr(projector, "_STAGED_BYTES", 5 * SIZE[0] * SIZE[1])
-    before = set(os.listdir("/dev/shm"))
     device, pictures = window(hold=2), noise(216)
-    assert set(os.listdir("/dev/shm")) <= before
+    assert not Path("/dev/shm", device._staging.name.strip("/")).exists()
     device.load(pictures)
     for index in (0, 4, 5, 99, 214, 215):
         device.show(index)
@@ -281,7 +301,7 @@ def test_keeps_the_screen_saver_away(one_window, server):
             assert not within(2.5, desktop.screen_saver_is_on)
             one_window.close()
             # Without the window it comes.
-            assert within(4.0, desktop.screen_saver_is_on)
+            assert within(15.0, desktop.screen_saver_is_on)
     finally:
         subprocess.run([*saver, "reset"], check=True)
         subprocess.run([*saver, "off"], check=True)

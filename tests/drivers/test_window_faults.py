@@ -62,6 +62,13 @@ def device(one_window):
     return device
 
 
+def shown_until_it_fails(device, index, within_s=5.0):
+    """Show a picture again and again: what happens to a window reaches its process a moment later."""
+    deadline = time.monotonic() + within_s
+    while time.monotonic() < deadline:
+        device.show(index)
+
+
 def recover(device, server):
     """What a bench does with a lost device; seconds it took."""
     begin = time.monotonic()
@@ -90,10 +97,8 @@ def test_a_window_that_is_lost_is_said_and_opened_again(device, server, name):
     act, said = LOST[name]
     with Desktop(server.display) as desktop:
         act(desktop)
-    # Events reach the window's process in their own time, well within one exposure.
-    time.sleep(0.05)
     with pytest.raises(DeviceLostError, match=said) as caught:
-        device.show(1)
+        shown_until_it_fails(device, 1)
     assert caught.value.repeatable
     assert caught.value.remedy
     assert device.state is DeviceState.FAULT
@@ -106,15 +111,15 @@ def test_a_window_that_is_lost_is_said_and_opened_again(device, server, name):
 @pytest.mark.parametrize("name", ["close", "move"])
 def test_a_playing_sequence_ends_when_the_window_is_lost(device, server, name):
     act, said = LOST[name]
-    device.load(sequence(400))
-    device.play()
-    time.sleep(0.05)
-    with Desktop(server.display) as desktop:
-        act(desktop)
+    device.load(sequence(1000))
     begin = time.monotonic()
+    device.play()
+    with Desktop(server.display) as desktop:
+        assert within(5.0, lambda: server.channel()[0, 0] == 80), "the second picture never came"
+        act(desktop)
     with pytest.raises(DeviceLostError, match=said):
-        device.finish(10.0)
-    assert time.monotonic() - begin < 2.0
+        device.finish(20.0)
+    assert time.monotonic() - begin < 1000 * device.period_s
     assert device.state is DeviceState.FAULT
 
 
@@ -129,10 +134,9 @@ def test_loss_after_the_last_picture_is_seen_on_request(device, server):
 def test_a_covered_window_breaks_the_sequence_and_not_the_device(device, server):
     with Desktop(server.display) as desktop:
         cover = desktop.cover(100, 0, 40, 20)
-        time.sleep(0.05)
         for _ in range(2):
             with pytest.raises(SequenceFaultError, match="it was covered by: mail has come"):
-                device.show(1)
+                shown_until_it_fails(device, 1)
         with pytest.raises(SequenceFaultError, match="mail has come"):
             device.load(sequence())
         assert device.state is DeviceState.ARMED
@@ -145,18 +149,17 @@ def test_a_covered_window_breaks_the_sequence_and_not_the_device(device, server)
 def test_a_window_beside_the_screen_does_not_matter(device, server):
     with Desktop(server.display) as desktop:
         desktop.cover(SIZE[0], 0, 40, 20)
-        time.sleep(0.05)
-        device.show(1)
         device.verify()
+        device.show(1)
 
 
 def test_a_cover_that_is_gone_again_breaks_the_sequence_it_was_in(device, server):
-    device.load(sequence(60))
+    device.load(sequence(1000))
     device.play()
     with Desktop(server.display) as desktop:
         desktop.uncover(desktop.cover(0, 0, 40, 20))
     with pytest.raises(SequenceFaultError, match="it was covered by"):
-        device.finish(10.0)
+        device.finish(20.0)
     assert device.state is DeviceState.ARMED
     # Nothing of it is left for the next one.
     device.load(sequence(5))
@@ -169,7 +172,7 @@ def test_what_was_covered_while_nobody_looked_is_drawn_again(device, server):
     with Desktop(server.display) as desktop:
         desktop.uncover(desktop.cover(0, 0, 40, 20))
         desktop.uncover(desktop.cover(50, 50, 40, 20))
-    assert within(2.0, lambda: not server.surface().any())
+    assert within(10.0, lambda: not server.surface().any())
 
 
 def test_a_process_that_is_killed_is_a_lost_device(device, server):
@@ -201,26 +204,31 @@ def test_a_process_that_hangs_while_it_plays_is_ended(device):
     assert not process.is_running()
 
 
-def assert_late(record, paused_s):
+PAUSED_S = 0.1
+
+
+def played_with_a_pause(device, server):
+    """Play a hundred pictures; once the second is on, the window's process stands still for a while."""
+    device.load(sequence(100))
+    device.play()
+    assert within(5.0, lambda: server.channel()[0, 0] == 80), "the second picture never came"
+    os.kill(device.pid, signal.SIGSTOP)
+    time.sleep(PAUSED_S)
+    os.kill(device.pid, signal.SIGCONT)
+    return device.finish(10.0)
+
+
+def assert_late(record):
     gaps = np.diff(record.shown_s)
     longest = int(gaps.argmax())
-    assert gaps[longest] > paused_s
+    # A flip may still be done in the moment in which the process is told to stand still.
+    assert gaps[longest] > 0.95 * PAUSED_S
     assert longest + 1 in record.late
-    assert len(record.shown_s) == 40
+    assert len(record.shown_s) == 100
 
 
-def pause(device, seconds):
-    os.kill(device.pid, signal.SIGSTOP)
-    time.sleep(seconds)
-    os.kill(device.pid, signal.SIGCONT)
-
-
-def test_a_flip_that_comes_late_is_told(device):
-    device.load(sequence(40))
-    device.play()
-    time.sleep(0.15)
-    pause(device, 0.1)
-    assert_late(device.finish(10.0), 0.1)
+def test_a_flip_that_comes_late_is_told(device, server):
+    assert_late(played_with_a_pause(device, server))
     assert device.describe()["counts"]["late"] >= 1
 
 
@@ -228,19 +236,16 @@ def locked(settings, clock):
     return WindowProjector(settings, clock, server=locked_screen.serve)
 
 
-def test_screen_with_a_refresh(one_window):
+def test_screen_with_a_refresh(one_window, server):
     device = one_window(make=locked, pacing="vsync", refresh_hz=None, max_jitter_ms=12)
     assert device.period_s == pytest.approx(locked_screen.REFRESH_S, rel=0.04)
     assert device.describe()["timing"]["locked"] is True
-    device.load(sequence(40))
-    device.play()
-    time.sleep(0.15)
-    pause(device, 0.1)
-    assert_late(device.finish(10.0), 0.1)
+    assert_late(played_with_a_pause(device, server))
 
 
 def test_a_rate_that_flips_cannot_keep_is_refused(one_window):
-    with pytest.raises(DeviceSettingError, match=r"a flip takes 1\d\.\d ms, too long for 1000 Hz"):
+    # The next refresh is 13.3 ms away, or more of them where the machine is busy.
+    with pytest.raises(DeviceSettingError, match=r"a flip takes (1[3-9]|[2-9]\d|\d{3,})\.\d ms, too long for 1000 Hz"):
         one_window(make=locked, refresh_hz=1000)
 
 
@@ -335,7 +340,7 @@ def test_the_end_of_the_x_server_is_a_lost_device(own_server):
         prepare(device)
         os.kill(own_server.pid, signal.SIGKILL)
         with pytest.raises(DeviceLostError, match=SERVER_GONE):
-            within(5.0, lambda: device.show(1) is None)
+            shown_until_it_fails(device, 1)
         device.darken()
     finally:
         device.close()

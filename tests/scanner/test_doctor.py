@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -100,17 +101,27 @@ def test_items_come_and_noise_does_not(strange, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+def assert_end(pids):
+    """The processes whose numbers are in the file end soon."""
+    deadline = time.monotonic() + 20
+    for pid in map(int, pids.read_text(encoding="utf-8").split()):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            while psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
+
+
 def test_what_hangs_is_ended_with_its_children_and_what_it_gave_is_kept(strange, tmp_path):
-    began = time.monotonic()
-    got = []
-    with pytest.raises(CutShortError, match=r"no answer within 1\.5 s"):
-        got.extend(iter(bounded(1.5, strange.hangs, str(tmp_path / "pids"))))
-    assert time.monotonic() - began < 4
-    for pid in map(int, (tmp_path / "pids").read_text(encoding="utf-8").split()):
-        deadline = time.monotonic() + 5
-        while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
+    pids = tmp_path / "pids"
+    for limit_s in (1.5, 6.0, 24.0):  # a busy machine takes a while to start a process
+        began, got = time.monotonic(), []
+        with pytest.raises(CutShortError, match=rf"no answer within {limit_s:g} s"):
+            got.extend(iter(bounded(limit_s, strange.hangs, str(pids))))
+        assert time.monotonic() - began < limit_s + 10
+        if got:
+            break
+    assert got == ["before"]
+    assert_end(pids)
 
 
 @pytest.mark.parametrize(
@@ -129,10 +140,8 @@ def test_what_fails_says_how(strange, function, error, words):
 def test_an_interrupted_look_leaves_no_process(strange, tmp_path):
     items = bounded(60.0, strange.hangs, str(tmp_path / "pids"))
     assert next(items) == "before"
-    pids = [int(p) for p in (tmp_path / "pids").read_text(encoding="utf-8").split()]
     items.close()
-    time.sleep(0.2)
-    assert not [p for p in pids if psutil.pid_exists(p) and psutil.Process(p).status() != psutil.STATUS_ZOMBIE]
+    assert_end(tmp_path / "pids")
 
 
 # --- the machine ------------------------------------------------------------------------------------------------------
@@ -151,7 +160,7 @@ def test_measured_machine_agrees_with_the_system(tmp_path):
     assert found.memory_bytes == memory["MemTotal"]
     assert found.available_bytes == pytest.approx(memory["MemAvailable"], rel=0.2)
     assert found.processors == len(os.sched_getaffinity(0))
-    assert 0 <= found.overslept_s < 1
+    assert 0 <= found.overslept_s < 10
     assert found.shared_free_bytes == pytest.approx(shutil.disk_usage("/dev/shm").free, rel=0.2)
 
 
@@ -314,20 +323,24 @@ def packages(tmp_path, monkeypatch):
 
 
 def test_packages_that_hang_or_crash_do_not_hide_the_others(packages, monkeypatch):
-    monkeypatch.setattr(examinations, "LIMIT_S", 2.0)
     packages(
         a_hangs="yield Finding('lamps', 'one', Verdict.OK, 'shines')\ntime.sleep(600)\n",
         b_crashes="os.abort()\nyield\n",
         c_works="yield Finding('lamps', 'two', Verdict.OK, f'shines {settings}')\n",
     )
-    found = list(examinations.examine_devices(None))
-    assert [(f.item, f.verdict.value) for f in found] == [
+    expected = [
         ("one", "ok"),
         ("examination a_hangs", "warning"),
         ("examination b_crashes", "warning"),
         ("two", "ok"),
     ]
-    assert "within 2 s" in found[1].text
+    for limit_s in (2.0, 8.0, 32.0):  # a busy machine takes a while to start a process
+        monkeypatch.setattr(examinations, "LIMIT_S", limit_s)
+        found = list(examinations.examine_devices(None))
+        if [(f.item, f.verdict.value) for f in found] == expected:
+            break
+    assert [(f.item, f.verdict.value) for f in found] == expected
+    assert f"within {limit_s:g} s" in found[1].text
     assert "SIGABRT" in found[2].text
     assert found[3].text == "shines None"
 

@@ -8,6 +8,7 @@ import time
 import psutil
 import pytest
 import serial
+from windows import within
 
 from sim_backend.clock import VirtualClock
 from sim_backend.trigger_box import PrawnBlasterEmulator, SltBoxEmulator
@@ -16,7 +17,7 @@ from sim_backend.trigger_box import PrawnBlasterEmulator, SltBoxEmulator
 @pytest.fixture
 def wired():
     """An emulator and a port at its near end."""
-    with SltBoxEmulator() as box, serial.Serial(box.port, timeout=1.0) as port:
+    with SltBoxEmulator() as box, serial.Serial(box.port, timeout=20.0) as port:
         yield box, port
 
 
@@ -48,12 +49,12 @@ def test_pulses_of_a_train_come_at_their_times(wired):
     heard = []
     box.on_pulse = lambda t_s: heard.append(time.monotonic() - t_s)
     assert ask(port, "GO") == "OK 10"
-    time.sleep(0.07)
+    assert within(20.0, lambda: len(heard) == 10)
     steps = [later - earlier for earlier, later in zip(box.pulses, box.pulses[1:], strict=False)]
     assert steps == pytest.approx([5e-3] * 9, abs=5e-6)
     # The thread is woken by the system's timer: late by as much as that is, never early.
     assert min(heard) > -1e-4
-    assert statistics.median(heard) < 5e-3
+    assert statistics.median(heard) < 15e-3, "a third of the train"
 
 
 def test_camera_answers_a_pulse_from_within_its_callback(wired):
@@ -90,7 +91,7 @@ def test_the_camera_has_the_pulse_before_the_host_has_the_answer(wired):
 
 def test_runs_on_a_clock_that_is_given():
     clock = VirtualClock()
-    with SltBoxEmulator(clock) as box, serial.Serial(box.port, timeout=1.0) as port:
+    with SltBoxEmulator(clock) as box, serial.Serial(box.port, timeout=20.0) as port:
         ask(port, "CFG OUT0 HIGH", "TRAIN 2 1000000 100 500000", "ARM")
         ask(port, "GO")
         time.sleep(0.02)
@@ -128,7 +129,7 @@ def test_port_keeps_its_name_and_the_box_starts_anew_when_it_is_plugged_in(wired
         os.close(taken)
     assert box.port == name
     assert box.output is None
-    with serial.Serial(name, timeout=1.0) as again:
+    with serial.Serial(name, timeout=20.0) as again:
         assert ask(again, "STAT?").startswith("OK RESET,sent=0/0")
 
 
@@ -136,10 +137,10 @@ def test_reboot_is_deaf_until_the_banner(wired):
     box, port = wired
     ask(port, "CFG OUT0 HIGH")
     begun = time.monotonic()
-    box.reboot(boot_s=0.1)
+    box.reboot(boot_s=0.5)
     port.write(b"STAT?\n")
     assert port.read_until(b"\n") == b"\n"
-    assert time.monotonic() - begun > 0.09
+    assert time.monotonic() - begun > 0.45
     assert port.read_until(b"\n").startswith(b"!BOOT SLT,emulator,EMU1,1.0.0,1*")
     assert ask(port, "STAT?").startswith("OK RESET")
 
@@ -150,10 +151,15 @@ def test_a_host_that_does_not_read_blocks_nobody(wired):
     for _ in range(2000):
         box.exposure(True)
         box.exposure(False)
-    port.reset_input_buffer()
-    time.sleep(0.05)
-    port.reset_input_buffer()
-    assert ",in=2000," in ask(port, "STAT?")
+    port.timeout = 0.2
+
+    def answered():
+        """What of the events still comes, comes before the answer, and may leave no room for it."""
+        port.reset_input_buffer()
+        port.write(b"STAT?\n")
+        return any(b",in=2000," in line for line in iter(lambda: port.read_until(b"\n"), b""))
+
+    assert within(20.0, answered)
 
 
 @pytest.mark.parametrize("emulator", [SltBoxEmulator, PrawnBlasterEmulator])
@@ -177,7 +183,7 @@ def test_leaves_no_thread_no_descriptor_and_no_file(emulator):
 
 @pytest.fixture
 def prawn():
-    with PrawnBlasterEmulator() as box, serial.Serial(box.port, timeout=1.0) as port:
+    with PrawnBlasterEmulator() as box, serial.Serial(box.port, timeout=20.0) as port:
 
         def say(command):
             port.write(command.encode() + b"\r\n")
@@ -206,17 +212,16 @@ def test_prawnblaster_answers_as_documented(prawn):
 
 def test_prawnblaster_runs_a_program(prawn):
     box, say = prawn
-    # Three pulses of 1 ms at 100 MHz, a wait of at most 2 ms, one pulse.
-    for address, (half, repeats) in enumerate([(100_000, 3), (200_000, 0), (50_000, 1), (0, 0)]):
+    # Three pulses of 50 ms at 100 MHz, a wait of at most 100 ms, one pulse.
+    for address, (half, repeats) in enumerate([(5_000_000, 3), (10_000_000, 0), (2_500_000, 1), (0, 0)]):
         assert say(f"set 0 {address} {half} {repeats}") == "ok"
     assert say("start") == "ok"
     assert say("status") == "run-status:2 clock-status:0"
     assert say("set 0 0 5 1").startswith("Cannot execute command set 0 0 5 1 during buffered execution")
-    time.sleep(0.02)
-    assert say("status") == "run-status:0 clock-status:0"
+    assert within(20.0, lambda: say("status") == "run-status:0 clock-status:0")
     begun = [pulse - box.pulses[0] for pulse in box.pulses]
     # A pulse lasts as long as the pause after it; the wait ran out.
-    assert begun == pytest.approx([0, 2e-3, 4e-3, 8e-3], abs=5e-6)
+    assert begun == pytest.approx([0, 0.1, 0.2, 0.4], abs=5e-6)
     assert say("getwait 0 0") == str(2**32 - 1)
 
 
@@ -232,12 +237,12 @@ def test_prawnblaster_waits_for_a_level(prawn):
     assert len(box.pulses) == 1
     box.strobe("EXT0")
     assert len(box.pulses) == 2
-    time.sleep(5e-3)
+    assert within(20.0, lambda: say("status") == "run-status:0 clock-status:0")
     say("hwstart")
     box.edge("EXT0", True)
-    time.sleep(5e-3)
-    assert say("status") == "run-status:0 clock-status:0"
+    assert within(20.0, lambda: say("status") == "run-status:0 clock-status:0")
     assert len(box.pulses) == 4
+    box.edge("EXT0", False)
     say("hwstart")
     assert say("abort") == "ok"
     assert say("status") == "run-status:5 clock-status:0"

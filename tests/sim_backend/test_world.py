@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from virtual import HEIGHT, LATENCY, WIDTH, all_photographed, photographed, require_virtual_bench, sequence, small
+from windows import within
 
 from drivers import DeviceLostError, FrameTimeoutError, HardwareError, SequenceFaultError
 from sim_backend.gentl import Fault, unplug
@@ -75,39 +76,50 @@ class TestStepByStep:
     def test_a_frozen_display_shows_the_pattern_before(self, stepped, world, patterns):
         stepped.prepare(patterns)
         photographed(stepped, 3)
-        world[0].call("freeze", 1.0)
-        frame, _ = photographed(stepped, 4)
+        world[0].call("freeze", 600.0)
+        try:
+            frame, _ = photographed(stepped, 4)
+        finally:
+            world[0].call("freeze", 0.0)
         np.testing.assert_array_equal(frame, patterns[3])
-        time.sleep(1.0)
         frame, _ = photographed(stepped, 5)
         np.testing.assert_array_equal(frame, patterns[5])
 
     def test_a_refresh_that_was_missed_is_within_the_settle_time(self, stepped, world, patterns):
-        stepped.prepare(patterns)
-        photographed(stepped, 3)
-        before = world[0].call("counts")["dropped"]
-        world[0].call("drop", 1)
-        frame, _ = photographed(stepped, 4)
-        assert world[0].call("counts")["dropped"] == before + 1
+        for _ in range(10):
+            stepped.prepare(patterns)
+            photographed(stepped, 3)
+            before = world[0].call("counts")
+            world[0].call("drop", 1)
+            frame, _ = photographed(stepped, 4)
+            after = world[0].call("counts")
+            assert after["dropped"] == before["dropped"] + 1
+            if after["skipped"] == before["skipped"]:  # nor did the machine keep the display from refreshing
+                break
         np.testing.assert_array_equal(frame, patterns[4])
 
     def test_a_display_slower_than_the_settle_time_shows_the_pattern_before(self, stepped, world, patterns):
-        stepped.prepare(patterns)
-        photographed(stepped, 3)
-        world[0].call("delay", 0.5)
-        try:
-            frame, _ = photographed(stepped, 4)
-        finally:
-            world[0].call("delay", LATENCY)
+        for _ in range(10):
+            stepped.prepare(patterns)
+            photographed(stepped, 3)
+            world[0].call("delay", 0.5)
+            try:
+                frame, stamp = photographed(stepped, 4)
+            finally:
+                world[0].call("delay", LATENCY)
+            time.sleep(0.6)
+            if stamp.t_device_s < stamp.t_shown_s + 0.45:  # exposed before the picture came, as on a machine with time
+                break
         np.testing.assert_array_equal(frame, patterns[3])
-        time.sleep(0.6)
 
     def test_an_exposure_across_a_change_mixes_both_patterns(self, stepped, world):
         dark, bright = (np.full((HEIGHT, WIDTH), level, np.uint8) for level in (20, 220))
         seen = []
         try:
             # From the flip about half a refresh passes to the scan-out; somewhere here it falls into the exposure.
-            for milliseconds in range(0, 24, 3):
+            for milliseconds in [*range(0, 24, 3)] * 3:
+                if {20, 220} < {int(frame.min()) for frame in seen}:
+                    break
                 world[0].call("delay", LATENCY)
                 stepped.prepare([dark, bright])
                 photographed(stepped, 0)
@@ -134,8 +146,7 @@ class TestStepByStep:
         photographed(stepped, 0)
         np.testing.assert_array_equal(world[0].call("shown"), patterns[0])
         stepped.darken()
-        time.sleep(LATENCY + 6 * PERIOD)
-        assert world[0].call("shown").max() == 0
+        assert within(10.0, lambda: world[0].call("shown").max() == 0)
 
     def test_a_lost_frame_times_out_and_the_sequence_can_be_repeated(self, stepped, world, patterns):
         stepped.prepare(patterns)
@@ -171,8 +182,14 @@ def test_deeper_pixels_arrive_whole(bench, patterns, bits, packed):
 
 def test_the_trigger_box_exposes_and_counts_back(world, bench, patterns):
     with bench(trigger="box") as boxed:
-        before = world[0].call("counts")
-        frames, _ = sequence(boxed, patterns)
+        for attempt in range(30):
+            before = world[0].call("counts")
+            try:
+                frames, _ = sequence(boxed, patterns, attempts=1)
+                break
+            except HardwareError as error:  # a busy machine may cost an attempt, as in a scan
+                if not error.repeatable or attempt == 29:
+                    raise
         after = world[0].call("counts")
         for what in ("pulses", "pictures", "changes"):
             assert after[what] - before[what] == SEQUENCE
@@ -201,18 +218,18 @@ class TestStreamed:
         np.testing.assert_array_equal(again[4][: HEIGHT // 2], patterns[4][: HEIGHT // 2])
 
     def test_a_frozen_display_is_noticed(self, streamed, world, patterns):
-        streamed.timeout_s, before = 0.3, streamed.timeout_s
         sequence(streamed, patterns)
         streamed.prepare(patterns)
-        world[0].call("freeze", 0.2)
+        streamed.timeout_s, before = 0.3, streamed.timeout_s
+        world[0].call("freeze", 600.0)
         try:
             with pytest.raises((FrameTimeoutError, SequenceFaultError)) as fault:
                 all_photographed(streamed, patterns)
         finally:
+            world[0].call("freeze", 0.0)
             streamed.darken()
             streamed.timeout_s = before
         assert fault.value.repeatable
-        time.sleep(0.2)
         frames, _ = sequence(streamed, patterns)
         np.testing.assert_array_equal(frames[-1][: HEIGHT // 2], patterns[-1][: HEIGHT // 2])
 
@@ -233,11 +250,16 @@ class TestStreamed:
 
 
 def test_the_display_refreshes_at_its_rate(world):
-    counts, began = world[0].call("counts"), time.monotonic()
+    def counted():
+        before, counts = time.monotonic(), world[0].call("counts")
+        return counts, before, time.monotonic()
+
+    counts, began, began_at_last = counted()
     time.sleep(0.5)
-    later, ended = world[0].call("counts"), time.monotonic()
+    later, ended, ended_at_last = counted()
     refreshes = sum(later[what] - counts[what] for what in ("scan_outs", "skipped"))
-    assert refreshes == pytest.approx((ended - began) / PERIOD, abs=2)
+    # Those that were skipped are counted at the next one, which may come a little late.
+    assert (ended - began_at_last) / PERIOD - 3 <= refreshes <= (ended_at_last - began) / PERIOD + 3
 
 
 def test_settings_that_cannot_work_are_refused():

@@ -132,7 +132,7 @@ def test_buffers_can_be_revoked_when_nobody_uses_them(folder):
         buffer = library.handle("DSGetBufferID", stream, 0)
         assert library("DSRevokeBuffer", stream, buffer, None, None) == BUSY
         library.write(port, 0x10D8, 1)  # TriggerSoftware
-        code, taken = library.event(event, 1000)
+        code, taken = library.event(event, 20_000)
         assert (code, taken) == (OK, buffer.value)
         library.must("DSRevokeBuffer", stream, buffer, None, None)
         assert [library.number("DSGetInfo", stream, command) for command in (3, 4, 5)] == [7, 7, 0]
@@ -147,7 +147,7 @@ def test_a_flush_waits_for_the_pixels_that_are_being_written(folder):
     with opened(folder, SimulatedCameraId(width_px=4096, height_px=3072), 0x010A0046) as (library, port, stream, _):
         met, started = False, 0
         while not met:
-            assert started < 20
+            assert started < 200
             library.write(port, 0x10D8, 1)  # TriggerSoftware
             started += 1
             wait_for(lambda expected=started: library.number("DSGetInfo", stream, 6) == expected)
@@ -183,7 +183,7 @@ def test_a_waiting_event_can_be_killed(folder):
         time.sleep(0.05)
         assert not ends
         library.must("EventKill", event)
-        waiting.join(2.0)
+        waiting.join(20.0)
         assert ends == [ABORT]
         assert library.event(event, 10)[0] == TIMEOUT
 
@@ -220,7 +220,7 @@ def test_every_frame_is_accounted_for_under_load(folder):
         for thread in threads:
             thread.start()
         triggers, end = 0, time.monotonic() + 1.0
-        while time.monotonic() < end:
+        while time.monotonic() < end or (len(fetched) <= 50 and time.monotonic() < end + 20.0):
             library.write(port, 0x10D8, 1)  # TriggerSoftware
             triggers += 1
         over.set()

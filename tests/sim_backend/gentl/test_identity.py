@@ -74,23 +74,23 @@ def test_unplugged_and_back_again(folder, how):
         nodes = software_triggered(acquirer)
         acquirer.start()
         shoot(acquirer)
-        nodes.SimReturnAfter.value = 300
+        nodes.SimReturnAfter.value = 1000
         if how == "feature":
             nodes.SimDisconnect.execute()
         elif how == "fault":
             nodes.SimDisconnectIn.value = 1
             nodes.TriggerSoftware.execute()
         else:
-            unplug(folder, "SIM0001", away_s=0.3)
+            unplug(folder, "SIM0001", away_s=1.0)
         with pytest.raises(gentl.IoException):
-            acquirer.fetch(timeout=1.0)
+            acquirer.fetch(timeout=20.0)
         assert acquirer.device.module.access_status == 3
         with pytest.raises(gentl.GenericException):
             acquirer.stop()
         acquirer.destroy()
         h.update()
         assert h.device_info_list == []
-        time.sleep(0.35)
+        time.sleep(1.05)
         h.update()
         acquirer = h.create({"serial_number": "SIM0001"})
         software_triggered(acquirer)
