@@ -81,6 +81,7 @@ def summarise(
         ("median sigma x px", maps.sigma_x, valid),
         ("median sigma y px", maps.sigma_y, valid),
         ("median sigma point mm", maps.sigma_point, valid),
+        ("median sigma rig mm", maps.sigma_rig, valid),
         ("median depth mm", maps.depth, valid),
         ("median epipolar distance px", None if maps.epipolar_px is None else np.abs(maps.epipolar_px), valid),
         ("median misfit round 2 chi2/dof", maps.misfit_round2, region),

@@ -71,7 +71,9 @@ class Maps:
     points
         (H, W, 3) mm in the camera frame.
     sigma_point
-        Predicted standard deviation along the viewing ray, mm.
+        Predicted standard deviation along the viewing ray from noise, mm.
+    sigma_rig
+        The same from the rig's own uncertainty, common to neighbours and to all scans; None where it states none.
     epipolar_px
         Distance of (x_p, y_p) from the pixel's epipolar line, px; None with one axis.
     x_p_round1, y_p_round1, misfit_round2
@@ -96,6 +98,7 @@ class Maps:
     depth: NDArray[np.float32] | None = None
     points: NDArray[np.float32] | None = None
     sigma_point: NDArray[np.float32] | None = None
+    sigma_rig: NDArray[np.float32] | None = None
     epipolar_px: NDArray[np.float32] | None = None
     x_p_round1: NDArray[np.float32] | None = None
     y_p_round1: NDArray[np.float32] | None = None

@@ -16,14 +16,17 @@ from pathlib import Path
 import numpy as np
 import platformdirs
 
+from sim_backend.edges import WIDEST_PX
 from sim_backend.settings import SceneSettings
 from sim_backend.transport import Transport, trace
 
 _log = logging.getLogger(__name__)
 _SOURCES = (
+    "blur",
     "cache",
     "camera_paths",
     "columns",
+    "edges",
     "kernels",
     "mesh_files",
     "meshes",
@@ -86,7 +89,7 @@ def transport_of(settings: SceneSettings) -> Transport:
     A cache that cannot be read or written costs time, never the scan.
     """
     if settings.scene.seen_once:
-        return trace(settings.scene.surfaces(), settings.rig(), settings.transport)
+        return trace(settings.scene.surfaces(), settings.rig(), settings.transport, settings.camera.blur_px)
     path = _folder(settings) / f"transport-{_content_hash(settings)}.npz"
     if path.exists():
         try:
@@ -98,7 +101,7 @@ def transport_of(settings: SceneSettings) -> Transport:
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             _log.warning("cached light transport %s is damaged (%s) and is traced again", path, error)
     _log.info("tracing the light of scene %s, once", settings.scene.name)
-    transport = trace(settings.scene.surfaces(), settings.rig(), settings.transport)
+    transport = trace(settings.scene.surfaces(), settings.rig(), settings.transport, settings.camera.blur_px)
     try:
         _store(transport, path, settings.cache_limit_mb * 1_000_000)
     except OSError as error:
@@ -120,6 +123,7 @@ def _content_hash(settings: SceneSettings) -> str:
         "scene": settings.scene.model_dump(mode="json"),
         "files": [hashlib.sha256(_content(path)).hexdigest() for path in settings.scene.files()],
         "rig": settings.rig().to_json(),
+        "blur_px": min(settings.camera.blur_px, WIDEST_PX),
         "transport": settings.transport.model_dump(mode="json"),
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]

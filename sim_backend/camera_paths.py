@@ -105,18 +105,15 @@ class CameraPaths:
     seen_in_mirror: SparseRows
 
 
-def trace_camera(
-    caster: RayCaster, camera: Viewpoint, projector: Viewpoint, supersample: int, bounces: int
-) -> CameraPaths:
-    """Follow ``supersample``² rays of each camera pixel, by at most ``bounces`` mirrors.
+def trace_camera(rays: CameraRays) -> CameraPaths:
+    """Follow the rays of all the camera's pixels.
 
     A pixel's value is the mean radiance (flux per mm² and sr) of what its rays meet; a projector pixel that is fully
     on sends out a flux of 1.
     """
-    width, height = camera.lens.size
-    rows = max(1, _RAYS_AT_ONCE // (width * supersample**2))
-    tracer = _Tracer(caster, camera, projector, supersample, bounces)
-    blocks = in_parallel(lambda r: tracer.trace(r, min(r + rows, height)), range(0, height, rows))
+    width, height = rays.camera.lens.size
+    rows = max(1, _RAYS_AT_ONCE // (width * rays.supersample**2))
+    blocks = in_parallel(lambda r: rays.trace(r, min(r + rows, height)), range(0, height, rows))
     views, direct, by_mirror, seen_in_mirror = (list(parts) for parts in zip(*blocks, strict=True))
     glimpses = Glimpses.joined(seen_in_mirror)
     pixels = width * height
@@ -129,8 +126,28 @@ def trace_camera(
     )
 
 
+def square_grid(squares: int) -> Array:
+    """(squares², 2) x and y of the middles of a pixel's squares, row by row, relative to its centre."""
+    offset = (np.arange(squares) + 0.5) / squares - 0.5
+    return np.stack(np.meshgrid(offset, offset), -1).reshape(-1, 2)
+
+
 @dataclass(frozen=True, eq=False)
-class _Tracer:
+class CameraRays:
+    """Follows rays of the camera's pixels.
+
+    Parameters
+    ----------
+    caster
+        Of the scene.
+    camera, projector
+        Where they stand.
+    supersample
+        Rays per pixel along each axis.
+    bounces
+        Mirrors that a ray is followed by, at most.
+    """
+
     caster: RayCaster
     camera: Viewpoint
     projector: Viewpoint
@@ -145,15 +162,11 @@ class _Tracer:
 
         direction = unit(self.camera.rays(np.stack((x, y), -1).reshape(-1, 2)))
         centre = self.caster.first_hits(self.camera.centre, direction)
-        uv, radiance = self.lit(centre, -direction)
+        uv, radiance = self.lit(centre, -direction, self.caster.diffuse(centre))
         x_p, y_p = np.where(self.in_picture(uv) & (radiance > 0), uv.T, np.nan)
 
-        offset = (np.arange(self.supersample) + 0.5) / self.supersample - 0.5
-        dy, dx = (d.ravel() for d in np.meshgrid(offset, offset, indexing="ij"))
-        direction = unit(self.camera.rays(np.stack((x[..., None] + dx, y[..., None] + dy), -1).reshape(-1, 2)))
-        hits = self.caster.first_hits(self.camera.centre, direction)
-        sides = self.sides(x, y, hits) if self.caster.sheets else None
-        sub_uv, sub_radiance = self.lit(hits, -direction, sides)
+        hits, direction, sides = self.samples(x.ravel(), y.ravel())
+        sub_uv, sub_radiance = self.lit(hits, -direction, self.caster.diffuse(hits, sides))
 
         surfaces, lit = hits.surface.reshape(-1, rays), (sub_radiance > 0).reshape(-1, rays)
         mixed = (surfaces != centre.surface[:, None]).any(1) | (lit != (radiance > 0)[:, None]).any(1)
@@ -177,16 +190,32 @@ class _Tracer:
         pixel = np.repeat(np.arange(first_row * width, end_row * width, dtype=np.int32), rays)
         return view, direct, *self.by_mirror(pixel, direction, hits)
 
-    def sides(self, x: Array, y: Array, hits: Hits) -> Array:
-        """(rays, 2, 3) sides of what each ray's square in the picture covers of its surface, mm.
+    def samples(self, x: Array, y: Array) -> tuple[Hits, Array, Array | None]:
+        """What the rays of pixels meet, pixel by pixel in rows.
 
-        ``x``, ``y`` (rows, columns) are the pixel centres, whose squares stand for those of all rays of a pixel.
+        Parameters
+        ----------
+        x, y
+            (n,) the pixels' centres.
+
+        Returns
+        -------
+        Hits of all n · ``supersample``² rays; their directions (rays, 3), unit; the sides (rays, 2, 3), mm, of what
+        each ray's square in the picture covers of its surface, None where nothing is printed.
         """
+        dx, dy = square_grid(self.supersample).T
+        px = np.stack((x[:, None] + dx, y[:, None] + dy), -1).reshape(-1, 2)
+        direction = unit(self.camera.rays(px))
+        hits = self.caster.first_hits(self.camera.centre, direction)
+        return hits, direction, self.sides(x, y, hits) if self.caster.sheets else None
+
+    def sides(self, x: Array, y: Array, hits: Hits) -> Array:
+        """(rays, 2, 3) as of `samples`; the pixels' squares stand for those of all their rays."""
         # Where a pixel sees several surfaces, one does for all: its print is not what matters there.
         surface = hits.surface.reshape(-1, self.supersample**2).max(1)
         ends = []
         for dx, dy in ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)):
-            direction = self.camera.rays(np.stack((x + dx, y + dy), -1).reshape(-1, 2))
+            direction = self.camera.rays(np.stack((x + dx, y + dy), -1))
             ends.append(self.caster.extended(surface, self.camera.centre, direction))
         sides = np.stack((ends[0] - ends[1], ends[2] - ends[3]), 1) / self.supersample
         return np.repeat(sides, self.supersample**2, axis=0)
@@ -205,16 +234,16 @@ class _Tracer:
             factor[at] = share[at] / mean if mean else 1.0
         return factor
 
-    def lit(self, hits: Hits, to_eye: Array, sides: Array | None = None) -> tuple[Array, Array]:
+    def lit(self, hits: Hits, to_eye: Array, diffuse: Array) -> tuple[Array, Array]:
         """Projector px (n, 2) of hit points, and the radiance (n,) that direct light gives them towards the eye.
 
-        ``sides`` as `RayCaster.diffuse`.
+        ``diffuse`` (n,) is the share of the light that they scatter evenly.
         """
         uv = self.projector.project(hits.point)
         irradiance = self.projector.density(uv, hits.point, hits.normal)
         radiance = reflected_radiance(
             self.caster.materials,
-            self.caster.diffuse(hits, sides),
+            diffuse,
             hits.surface,
             self.projector.centre,
             hits.point,
@@ -251,7 +280,7 @@ class _Tracer:
                 break
             pixel, direction, share = pixel[on], turned[on], share[on] * reflected[on]
             hits = self.caster.first_hits(hits.point[on], direction, leaving=hits.normal[on])
-            uv, radiance = self.lit(hits, -direction)
+            uv, radiance = self.lit(hits, -direction, self.caster.diffuse(hits))
             at = np.flatnonzero(radiance > 0)
             u, v = uv[at].T.astype(np.float32)
             paths.append(Paths(pixel[at], u, v, (share * radiance)[at].astype(np.float32)))

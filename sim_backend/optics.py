@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ive
 
 from drivers import FrameFormat, NoiseModel, Pixels
+from sim_backend.blur import blurred, blurred_within_more
 from sim_backend.kernels import Floats
 from sim_backend.settings import CameraSettings, ProjectorSettings, SceneSettings
 from sim_backend.transport import Transport
@@ -73,22 +73,30 @@ class Optics:
 
     def projector_blurred(self, light: Floats) -> Floats:
         """The same picture (height, width) out of focus."""
-        return _blurred(light, self.projector.blur_px)
+        return blurred(light, self.projector.blur_px)
 
     def camera_blurred(self, light: Floats) -> Floats:
-        """The same picture (height, width) as the camera's lens draws it."""
-        # The scene goes on beyond the picture. An odd reflection continues fringes in phase; a copy of the border would
-        # shift them by a tenth of a pixel there.
-        margin = math.ceil(4 * self.camera.blur_px)
-        wider = np.pad(light, margin, mode="reflect", reflect_type="odd") if margin else light
-        return _blurred(wider, self.camera.blur_px)[margin : margin + light.shape[0], margin : margin + light.shape[1]]
+        """A picture (height, width) of the light at the pixels, as the camera's lens draws it where it has no edges."""
+        return blurred_within_more(light, self.camera.blur_px)
+
+    def direct_picture(self, light_out: Floats) -> Floats:
+        """(height, width) radiance of direct light as the camera's pixels get it through its lens."""
+        transport = self.transport
+        picture = self.camera_blurred(transport.direct_light(light_out))
+        # The lens blurs before the pixels sample: at edges that makes a difference, by `sim_backend.edges`.
+        transport.edges.add_to(picture, light_out, self.camera.blur_px)
+        return picture
+
+    def bounced_picture(self, light_out: Floats) -> Floats:
+        """(height, width) the same of light that took more than one reflection."""
+        return self.camera_blurred(self.transport.bounced_light(light_out))
 
     def grey(self, shown: Shown) -> Floats:
         """(height, width) expected grey value of a frame, without noise and rounding."""
         out = self.light_out(shown)
-        light = self.transport.direct_light(out) + self.transport.bounced_light(out)
+        light = self.direct_picture(out) + self.bounced_picture(out)
         ambient = self.camera.ambient_dn * self.camera.exposure_us / _REFERENCE_EXPOSURE_US
-        return self.camera_blurred(light) * np.float32(self.gain) + np.float32(ambient)
+        return light * np.float32(self.gain) + np.float32(ambient)
 
 
 @dataclass(frozen=True)
@@ -129,21 +137,3 @@ class Sensor:
         signal += sigma * random.standard_normal(signal.shape, np.float32)
         np.rint(signal, out=signal)
         out[...] = np.clip(signal, 0, self.frame_format.saturated_dn, out=signal)
-
-
-def _blurred(picture: Floats, sigma_px: float) -> Floats:
-    if sigma_px == 0:
-        return picture
-    kernel = _gaussian(sigma_px)
-    return np.asarray(cv2.sepFilter2D(picture, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE), np.float32)
-
-
-@cache
-def _gaussian(sigma_px: float) -> Floats:
-    """Kernel of a Gaussian on a grid: e^(-σ²) I_n(σ²), whose variance is σ² even for narrow ones.
-
-    A sampled Gaussian of σ = 0.5 px is 14 % too small there (Lindeberg, IEEE TPAMI 12(3), 1990).
-    """
-    reach = math.ceil(4 * sigma_px) + 1
-    kernel = ive(np.abs(np.arange(-reach, reach + 1)), sigma_px**2)
-    return np.asarray(kernel / kernel.sum(), np.float32)

@@ -111,6 +111,13 @@ class RayCaster:
             share[at] = sheet.reflectance(hits.point[at], np.zeros((at.size, 2, 3)) if sides is None else sides[at])
         return share
 
+    def unprinted(self, hits: Hits) -> Array:
+        """(n,) the same as `diffuse` where nothing is printed."""
+        light = self.materials[:, 0].copy()
+        for number, sheet in self.sheets.items():
+            light[number] = sheet.light
+        return np.asarray(light[hits.surface])
+
     def visible(self, point: Array, normal: Array, target: Array) -> NDArray[np.bool_]:
         """Whether nothing stands between points (n, 3), seen from the side of their normals, and ``target`` (3,)."""
         start = point + CLEARANCE_MM * normal

@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from scanner.rig import Rig
-from sim_backend.camera_paths import Paths, View, trace_camera
+from sim_backend.camera_paths import CameraRays, Paths, View, square_grid, trace_camera
 from sim_backend.columns import Columns
+from sim_backend.edges import LensEdges, lens_edges
 from sim_backend.kernels import Floats, SparseRows, in_parallel, spread_spots
 from sim_backend.projector_paths import Photons, emit, follow
 from sim_backend.raycasting import MISS, RayCaster
@@ -130,6 +131,8 @@ class Transport:
         (camera pixels, camera pixels) how that light is seen in mirrors.
     spreads
         Surfaces within whose material light wanders.
+    edges
+        What the camera's lens makes of edges in the direct light.
     """
 
     projector_size: tuple[int, int]
@@ -138,7 +141,8 @@ class Transport:
     by_mirror: SparseRows
     bounces: tuple[Bounce, ...]
     seen_in_mirror: SparseRows
-    spreads: tuple[Spread, ...] = ()
+    spreads: tuple[Spread, ...]
+    edges: LensEdges
 
     def direct_light(self, light_out: Floats) -> Floats:
         """(height, width) radiance of direct light for what the projector sends out, (height, width) in 0..1."""
@@ -169,6 +173,8 @@ class Transport:
         arrays |= {f"view.{f.name}": getattr(self.view, f.name) for f in fields(View)}
         for name in ("direct", "by_mirror", "seen_in_mirror"):
             arrays |= _matrix_arrays(name, getattr(self, name))
+        arrays |= {"edges.blur_px": np.array(self.edges.blur_px), "edges.pixel": self.edges.pixel}
+        arrays |= _matrix_arrays("edges.rows", self.edges.rows)
         for number, bounce in enumerate(self.bounces):
             scalars = [bounce.diffuse, bounce.block_px, bounce.cell_px, bounce.surface]
             arrays |= {f"bounce.{number}.scalars": np.array(scalars), f"bounce.{number}.cell": bounce.cell}
@@ -192,13 +198,27 @@ class Transport:
             tuple(bounces),
             _matrix("seen_in_mirror", arrays),
             tuple(Spread(int(s[0]), float(s[1]), (float(s[2]), float(s[3]))) for s in arrays["spreads"]),
+            LensEdges(float(arrays["edges.blur_px"]), arrays["edges.pixel"], _matrix("edges.rows", arrays)),
         )
 
 
-def trace(surfaces: Sequence[Surface], rig: Rig, settings: TransportSettings) -> Transport:
-    """Trace all light of a scene; deterministic."""
+def trace(surfaces: Sequence[Surface], rig: Rig, settings: TransportSettings, blur_px: float = 0.0) -> Transport:
+    """Trace all light of a scene; deterministic.
+
+    Parameters
+    ----------
+    surfaces
+        Of the scene.
+    rig
+        Camera and projector.
+    settings
+        How finely.
+    blur_px
+        Standard deviation of the camera lens's blur, camera px, for what it makes of edges.
+    """
     caster, camera, projector = RayCaster(surfaces), Viewpoint.camera(rig), Viewpoint.projector(rig)
-    seen = trace_camera(caster, camera, projector, settings.supersample, settings.specular_bounces)
+    rays = CameraRays(caster, camera, projector, settings.supersample, settings.specular_bounces)
+    seen = trace_camera(rays)
     alone = len(surfaces) == 1 and not surfaces[0].lights_itself
     bounced = [] if alone else _bounced(surfaces, _Bounces(caster, camera, projector, seen.view), settings)
     return Transport(
@@ -209,6 +229,7 @@ def trace(surfaces: Sequence[Surface], rig: Rig, settings: TransportSettings) ->
         tuple(bounced),
         seen.seen_in_mirror,
         tuple(_spreads(surfaces, rig, seen.view)),
+        lens_edges(rays, seen.view, seen.direct, blur_px),
     )
 
 
@@ -339,7 +360,7 @@ class _Bounces:
 
         def batch(first: int) -> _Arrivals:
             random = np.random.default_rng(first)
-            here = np.stack((column, row), 1)[first : first + at_once, None] + _grid(squares)
+            here = np.stack((column, row), 1)[first : first + at_once, None] + square_grid(squares)
             if surface is None:
                 # Off the regular grid, so that few photons per pixel make noise and no moiré.
                 here += (random.random(here.shape) - 0.5) / squares
@@ -446,12 +467,6 @@ def _spacing_px(found: _Arrivals, camera_size: tuple[int, int]) -> float:
     square = (found.y // side).astype(np.int64) * 64 + (found.x // side).astype(np.int64)
     _, which, count = np.unique(square, return_inverse=True, return_counts=True)
     return float(side / np.sqrt(np.median(count[which])))
-
-
-def _grid(squares: int) -> Array:
-    """(squares², 2) middles of the squares of a grid on a pixel, relative to the pixel's centre."""
-    offset = (np.arange(squares) + 0.5) / squares - 0.5
-    return np.stack(np.meshgrid(offset, offset), -1).reshape(-1, 2)
 
 
 def _even_set(count: int) -> Array:

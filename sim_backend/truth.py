@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.rig import Rig
+from sim_backend.edges import mixing
 from sim_backend.kernels import Floats
 from sim_backend.optics import Optics, Sensor
 from sim_backend.scenes import Window
@@ -71,9 +72,7 @@ class Truth:
     @cached_property
     def edge(self) -> NDArray[np.bool_]:
         """Pixels that mix surfaces, depths, or light and shadow, within themselves or through the camera's blur."""
-        view = self.optics.transport.view
-        mixed = view.mixed | _changes(view.surface) | _changes(np.isfinite(view.x_p))
-        mixed |= _jumps(view.depth, float(self.rig.camera.matrix[0, 0]))
+        mixed = mixing(self.optics.transport.view, float(self.rig.camera.matrix[0, 0]))
         reach = math.ceil(3 * self.optics.camera.blur_px)
         return np.asarray(cv2.dilate(mixed.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)), bool)
 
@@ -90,8 +89,7 @@ class Truth:
 
     def _light(self, pattern: NDArray[np.float64]) -> tuple[Floats, Floats]:
         out = self.optics.projector_blurred(pattern.astype(np.float32))
-        transport = self.optics.transport
-        return tuple(self.optics.camera_blurred(y) for y in (transport.direct_light(out), transport.bounced_light(out)))  # type: ignore[return-value]
+        return self.optics.direct_picture(out), self.optics.bounced_picture(out)
 
     @cached_property
     def alpha(self) -> Floats:
@@ -132,22 +130,3 @@ class Truth:
     def bounce_y(self) -> Floats:
         """Mean projector row, px, as `bounce_x`."""
         return self._bounce[1]
-
-
-def _jumps(depth: Floats, focal_px: float) -> NDArray[np.bool_]:
-    """Pixels beside which the depth jumps by more than two pixels are wide there.
-
-    On planes the inverse of the depth is linear in the picture, so that its second difference vanishes.
-    """
-    near = 1 / depth.astype(np.float64)
-    jumps = np.zeros(depth.shape, bool)
-    for along, flags in ((near, jumps), (near.T, jumps.T)):
-        flags[1:-1] |= np.abs(along[2:] - 2 * along[1:-1] + along[:-2]) > 2 / focal_px * along[1:-1]
-    return jumps
-
-
-def _changes(labels: NDArray[np.int8] | NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels whose label differs from that of a neighbour."""
-    picture = (labels.astype(np.int16) + 1).astype(np.uint8)
-    box = np.ones((3, 3), np.uint8)
-    return np.asarray(cv2.dilate(picture, box) != cv2.erode(picture, box))

@@ -39,10 +39,9 @@ def test_focal_lengths_baseline_and_residuals(one_rig, capsys):
     assert figure["camera"] <= 3e-4
     assert figure["projector"] <= 6e-4
     assert abs(figure["baseline"]) <= 2e-4
-    assert figure["ratio_projector"] == pytest.approx(1, abs=0.15)
-    # A corner's σ allows for all of its misfit. Simulated edges are blurred after they are sampled, so that they do not
-    # fit, and a part of that averages out along them: over nineteen random rigs the ratio was 0.80 to 1.09.
-    assert 0.75 < figure["ratio_camera"] < 1.2
+    # Two hundred residuals and ten times as many scatter by a few per cent; the rest is for what the models leave out.
+    for lens in ("camera", "projector"):
+        assert figure[f"ratio_{lens}"] == pytest.approx(1, abs=0.15)
     # Twenty-odd correlated errors of one rig; intervals that are too narrow by half would give 2.
     assert figure["spread"] < 1.7
 

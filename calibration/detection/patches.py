@@ -109,9 +109,10 @@ def least_squares(
         residual = grey - (basis @ levels[:, :, None])[:, :, 0]
         design = np.concatenate((derivatives * amplitude[:, :, None], basis), axis=2)
         step = _solved(design, residual, patches.weights)[:, :free]
-        parameters = clipped(parameters + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP))
+        before, parameters = parameters, clipped(parameters + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP))
         moved = np.abs(step[:, :2]).max(axis=1)
-        if not (moved > _DONE_PX).any():
+        # All of them: a point that is in its place already has no χ² before its blur is right.
+        if not (np.abs(parameters - before) > _DONE_PX).any():
             break
     used = np.maximum(patches.weights.sum(axis=1) - design.shape[2], 1)
     chi2 = (patches.weights * residual**2).sum(axis=1) / noise_dn**2

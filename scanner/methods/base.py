@@ -272,6 +272,7 @@ def refuse_off_epipolar(maps: Maps, rig: Rig | None) -> Maps:
     if rig is None or (maps.x_p is None and maps.y_p is None):
         return maps
     # The rig's geometry is compiled code of its own: a round that is decoded without a rig does not load it.
+    from scanner.rig_uncertainty import sigma_rig
     from scanner.triangulation import triangulate
 
     found = triangulate(rig, maps.x_p, maps.sigma_x, maps.y_p, maps.sigma_y)
@@ -300,5 +301,6 @@ def refuse_off_epipolar(maps: Maps, rig: Rig | None) -> Maps:
         points=points,
         depth=points[..., 2],
         sigma_point=np.where(lost, nan, found.sigma_point),
+        sigma_rig=sigma_rig(rig, points[..., 2], maps.sigma_x, maps.sigma_y),
         epipolar_px=found.epipolar_px,
     )

@@ -119,6 +119,10 @@ def _key_figures(result: ScanResult) -> str:
     tiles.append(("coverage", per_cent(coverage), "of the pixels with fringes have a coordinate"))
     if maps.sigma_point is not None:
         tiles.append(("median σ", length(median(maps.sigma_point)), "predicted, along the viewing ray"))
+        if maps.sigma_rig is not None:
+            tiles.append(
+                ("median σ of the rig", length(median(maps.sigma_rig)), "common to neighbours and to all scans")
+            )
     else:
         for axis, sigma in (("x", maps.sigma_x), ("y", maps.sigma_y)):
             if sigma is not None:

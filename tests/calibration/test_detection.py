@@ -67,6 +67,18 @@ def test_errors_are_what_sigma_says_on_a_tilted_board_behind_a_distorting_lens(k
     assert np.abs(common.mean(axis=0)).max() < 0.001
 
 
+def test_sigma_does_not_depend_on_how_well_the_finder_began():
+    """Points that are in their places at once still need their blurs: σ holds what the edges miss."""
+    noise = 0.25
+    clean = picture(
+        View(BoardPose(620, yaw_deg=15, pitch_deg=-10, roll_deg=8), *camera(1900.0)), BOARDS["chessboard"], 0.5
+    )
+    noisy = clean + noise * np.random.default_rng(5).standard_normal(clean.shape)
+    without, with_noise = (find_board(p, BOARDS["chessboard"], noise) for p in (clean, noisy))
+    np.testing.assert_array_equal(without.ids, with_noise.ids)
+    np.testing.assert_allclose(np.median(without.sigma), np.median(with_noise.sigma), rtol=0.1)
+
+
 def test_corners_are_better_than_those_of_the_usual_refinement():
     board = BOARDS["chessboard"]
     truth = TILTED.project(board.points)

@@ -59,6 +59,7 @@ def result(**changes: object) -> ScanResult:
         depth=points[..., 2],
         points=points,
         sigma_point=measured(0.02 * ones),
+        sigma_rig=measured(0.01 * ones),
         epipolar_px=measured(0 * u),
         x_p_round1=measured(u * 10),
         y_p_round1=measured(v * 10),
@@ -162,7 +163,18 @@ def test_round_trip(written: Path) -> None:
 
 
 def test_one_axis_without_rig(tmp_path: Path) -> None:
-    absent = ("y_p", "sigma_y", "depth", "points", "sigma_point", "epipolar_px", "lit", "y_p_round1", "variation")
+    absent = (
+        "y_p",
+        "sigma_y",
+        "depth",
+        "points",
+        "sigma_point",
+        "sigma_rig",
+        "epipolar_px",
+        "lit",
+        "y_p_round1",
+        "variation",
+    )
     given = result()
     given = replace(given, maps=replace(given.maps, **dict.fromkeys(absent)))
     write_result(tmp_path, given, report=False)

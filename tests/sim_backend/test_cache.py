@@ -89,10 +89,16 @@ def test_a_damaged_entry_is_traced_again(settings, traced, tmp_path, damage, cap
 def test_only_what_changes_the_light_is_traced_again(settings, traced):
     transport_of(settings())
     transport_of(settings(seed=7, settle_s=0.1, faults={"drop_at": [3]}))
-    transport_of(settings(camera={"width_px": 64, "height_px": 48, "exposure_us": 5000.0, "blur_px": 1.0}))
+    transport_of(settings(camera={"width_px": 64, "height_px": 48, "exposure_us": 5000.0}))
     assert len(traced) == 1
     transport_of(settings(baseline_mm=150.0))
     transport_of(settings(scene="plane"))
+    assert len(traced) == 3
+
+
+def test_the_lens_is_part_of_the_light_as_far_as_it_blurs_before_sampling(settings, traced):
+    for blur_px in (0.5, 0.4, 1.0, 3.0):
+        transport_of(settings(camera={"width_px": 64, "height_px": 48, "blur_px": blur_px}))
     assert len(traced) == 3
 
 

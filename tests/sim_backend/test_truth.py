@@ -13,7 +13,7 @@ def _decoded(truth, axis, period=16, steps=12):
     for n in range(1, steps + 1):
         fringe = 0.5 + 0.5 * np.cos(2 * np.pi * (u / period + n / steps))
         out = optics.projector_blurred(np.broadcast_to(fringe, (height, width)).astype(np.float32))
-        light = optics.camera_blurred(optics.transport.direct_light(out) + optics.transport.bounced_light(out))
+        light = optics.direct_picture(out) + optics.bounced_picture(out)
         phasor += optics.gain * light * np.exp(-2j * np.pi * n / steps) * 2 / steps
     return phasor
 
