@@ -23,14 +23,14 @@ FIELDS = 17
 ROWS = 2 * FIELDS + 1
 """Of a pixel's result: the best hypothesis, its rival, and half the difference of their scores."""
 
-_FIRST_STEPS = 3
+_FIRST_STEPS = 2
 """Levenberg-Marquardt steps after which hopeless hypotheses are given up."""
-_HOPELESS_CHI2 = 60.0
+_HOPELESS_CHI2 = 25.0
 """Excess over the best hypothesis from which one is hopeless."""
 _STEPS = 12
 """Further steps at most; two or three are usual."""
-_CONVERGED_CHI2 = 1e-3
-"""A step that lowers χ² by less ends a refinement: it moves no coordinate by more than 1/30 of its σ."""
+_CONVERGED_CHI2 = 1e-2
+"""A step that lowers χ² by less ends a refinement: it moves no coordinate by more than 1/10 of its σ."""
 _VISIBLE_SIGMAS = 5.0
 """A direct path that is weaker than this is none."""
 _SAME_PX = 0.5
@@ -39,70 +39,77 @@ _TINY = 1e-300
 
 
 @compiled  # pragma: no cover
-def _axis_normal(
-    y: Phasors, g: Reals, omega0: float, step: float, theta: Reals, first: int, normal: Reals, slope: Reals
-) -> float:
-    """Add the data of one axis to the normal equations; returns its χ².
+def _load(
+    z: NDArray[np.complex64], gain: Reals, sigma: float, p: int, omega0: float, step: float, y: Phasors, w: Reals
+) -> None:  # fmt: skip
+    """Phasors of a pixel over the trend, and the sums' weights: ``w[k]`` are g ωᵏ, and ``w[3]`` starts with Σ g|y|²."""
+    power = 0.0
+    for t in range(z.shape[0]):
+        omega = omega0 + t * step
+        y[t] = (1 / gain[t]) * z[t, p]
+        w[0, t] = (gain[t] / sigma) ** 2
+        w[1, t] = w[0, t] * omega
+        w[2, t] = w[1, t] * omega
+        power += w[0, t] * (y[t].real * y[t].real + y[t].imag * y[t].imag)
+    w[3, 0] = power
 
-    ``theta[first:first + 4]`` are u₁, u₂, a₁, a₂; ``y`` (T,) the phasors over trend and noise, ``g`` (T,) the weights.
+
+@compiled  # pragma: no cover
+def _axis_normal(
+    y: Phasors, w: Reals, omega0: float, step: float, theta: Reals, first: int, normal: Reals, slope: Reals
+) -> float:
+    """Write the data of one axis into the normal equations; returns its χ².
+
+    ``theta[first:first + 4]`` are u₁, u₂, a₁, a₂; ``y`` (T,) and ``w`` (4, T) as `_load` leaves them.
     """
     u1, u2, a1, a2 = theta[first], theta[first + 1], theta[first + 2], theta[first + 3]
-    e1, turn1 = rotation(omega0 * u1), rotation(step * u1)
-    e2, turn2 = rotation(omega0 * u2), rotation(step * u2)
-    chi2 = 0.0
-    n00 = n01 = n03 = n11 = n12 = n22 = n23 = 0.0
-    s0 = s1 = s2 = s3 = 0.0
+    e1, turn1 = rotation(-omega0 * u1), rotation(-step * u1)
+    e2, turn2 = rotation(-omega0 * u2), rotation(-step * u2)
+    c1 = c2 = f1 = f2 = m0 = m1 = m2 = s0 = s2 = 0.0
     for t in range(y.size):
-        w, omega = g[t], omega0 + t * step
-        off = y[t] - a1 * e1 - a2 * e2
-        chi2 += w * (off.real * off.real + off.imag * off.imag)
         # In turned coordinates: what is along a path changes its amplitude, what is across its place.
-        q1, q2, p = e1.conjugate() * off, e2.conjugate() * off, e1.conjugate() * e2
-        wo = w * omega
-        s0 += wo * q1.imag
-        s1 += wo * q2.imag
-        s2 += w * q1.real
-        s3 += w * q2.real
-        n00 += wo * omega
-        n01 += wo * omega * p.real
-        n03 += wo * p.imag
-        n22 += w
-        n23 += w * p.real
+        q1, q2, p = e1 * y[t], e2 * y[t], e1 * e2.conjugate()
+        w0, w1, w2 = w[0, t], w[1, t], w[2, t]
+        c1 += w0 * q1.real
+        c2 += w0 * q2.real
+        f1 += w1 * q1.imag
+        f2 += w1 * q2.imag
+        m0 += w0 * p.real
+        m1 += w1 * p.imag
+        m2 += w2 * p.real
+        s0 += w0
+        s2 += w2
         e1 *= turn1
         e2 *= turn2
-    n11, n12 = n00, -n03
     i, j, k, m = first, first + 1, first + 2, first + 3
-    normal[i, i] += a1 * a1 * n00
-    normal[j, i] += a1 * a2 * n01
-    normal[j, j] += a2 * a2 * n11
-    # Re(conj(i ω a₁ e₁) e₂) = ω a₁ Im(conj(e₁) e₂), and the other way round.
-    normal[m, i] += a1 * n03
-    normal[k, j] += a2 * n12
-    normal[k, k] += n22
-    normal[m, k] += n23
-    normal[m, m] += n22
-    slope[i] += a1 * s0
-    slope[j] += a2 * s1
-    slope[k] += s2
-    slope[m] += s3
-    return chi2
+    normal[i, i] = a1 * a1 * s2
+    normal[j, i] = a1 * a2 * m2
+    normal[j, j] = a2 * a2 * s2
+    # Re(conj(i ω a₁ e₁) e₂) = ω a₁ Im(conj(e₁) e₂), and the other way round; a path's own is zero.
+    normal[k, i], normal[m, i] = 0.0, a1 * m1
+    normal[k, j], normal[m, j] = -a2 * m1, 0.0
+    normal[k, k], normal[m, k], normal[m, m] = s0, m0, s0
+    slope[i] = a1 * (f1 - a2 * m1)
+    slope[j] = a2 * (f2 + a1 * m1)
+    slope[k] = c1 - a1 * s0 - a2 * m0
+    slope[m] = c2 - a2 * s0 - a1 * m0
+    return float(w[3, 0] - a1 * (c1 + slope[k]) - a2 * (c2 + slope[m]))
 
 
 @compiled  # pragma: no cover
 def _normal_equations(
-    za: Phasors, ga: Reals, zb: Phasors, gb: Reals, comb: Reals, prior: Reals, theta: Reals, normal: Reals, slope: Reals
+    ya: Phasors, wa: Reals, yb: Phasors, wb: Reals, comb: Reals, prior: Reals, theta: Reals, normal: Reals, slope: Reals
 ) -> float:  # fmt: skip
     """χ² of both axes and the priors, its Gauss-Newton matrix (lower half) and the negative half gradient.
 
     ``comb`` holds 2πf₀ and 2πΔf of the axis along and of the axis across. ``prior`` holds where the epipolar line is
     left, the place across there, the line's slope, its σ; ln κ; σ of the two log ratios of amplitudes.
     """
-    for a in range(8):
-        slope[a] = 0.0
-        for b in range(a + 1):
+    for a in range(4, 8):
+        for b in range(4):
             normal[a, b] = 0.0
-    chi2 = _axis_normal(za, ga, comb[0], comb[1], theta, 0, normal, slope)
-    chi2 += _axis_normal(zb, gb, comb[2], comb[3], theta, 4, normal, slope)
+    chi2 = _axis_normal(ya, wa, comb[0], comb[1], theta, 0, normal, slope)
+    chi2 += _axis_normal(yb, wb, comb[2], comb[3], theta, 4, normal, slope)
     weight = 1 / (prior[3] * prior[3])
     off = theta[4] - prior[1] - prior[2] * (theta[0] - prior[0])
     chi2 += weight * off * off
@@ -162,7 +169,7 @@ def _solve(factor: Reals, right: Reals, out: Reals) -> None:
 
 @compiled  # pragma: no cover
 def _improve(
-    za: Phasors, ga: Reals, zb: Phasors, gb: Reals, comb: Reals, prior: Reals, theta: Reals, chi2: float, steps: int,
+    ya: Phasors, wa: Reals, yb: Phasors, wb: Reals, comb: Reals, prior: Reals, theta: Reals, chi2: float, steps: int,
     normal: Reals, slope: Reals, work: Any,
 ) -> Any:  # fmt: skip
     """Levenberg-Marquardt from ``theta``, whose χ² and normal equations are given; all are brought up to date.
@@ -185,7 +192,7 @@ def _improve(
                 shorten = min(shorten, -0.7 * theta[k] / step[k])
         for k in range(8):
             trial[k] = theta[k] + shorten * step[k]
-        gained = _normal_equations(za, ga, zb, gb, comb, prior, trial, normal2, slope2)
+        gained = _normal_equations(ya, wa, yb, wb, comb, prior, trial, normal2, slope2)
         if gained <= chi2:
             converged = chi2 - gained < _CONVERGED_CHI2
             chi2 = gained
@@ -223,7 +230,7 @@ def joint_block(
     """
     count_a, count_b, most = za.shape[0], zb.shape[0], bounds.shape[1]
     ya, yb = np.empty(count_a, np.complex128), np.empty(count_b, np.complex128)
-    ga, gb = np.empty(count_a), np.empty(count_b)
+    wa, wb = np.empty((4, count_a)), np.empty((4, count_b))
     thetas, priors, gradients = np.empty((most, 8)), np.empty((most, 7)), np.empty((most, 8))
     chi2s, scores, done = np.empty(most), np.empty(most), np.zeros(most, np.bool_)
     normals, factor, normal2 = np.zeros((most, 8, 8)), np.zeros((8, 8)), np.zeros((8, 8))
@@ -235,10 +242,8 @@ def joint_block(
     work = (factor, step, trial, normal2, slope2, nothing)
     for n in range(bounds.shape[0]):
         p = start + n
-        for t in range(count_a):
-            ya[t], ga[t] = (1 / gain_a[t]) * za[t, p], (gain_a[t] / sigma_a[p]) ** 2
-        for t in range(count_b):
-            yb[t], gb[t] = (1 / gain_b[t]) * zb[t, p], (gain_b[t] / sigma_b[p]) ** 2
+        _load(za, gain_a, sigma_a[p], p, comb[0], comb[1], ya, wa)
+        _load(zb, gain_b, sigma_b[p], p, comb[2], comb[3], yb, wb)
         tried, least = 0, math.inf
         for h in range(most):
             if not bounds[n, h] < math.inf:
@@ -249,9 +254,9 @@ def joint_block(
             for k in range(8):
                 theta[k] = seeds[n, h, k]
             _set_line(priors[tried], prior, lines[n, h, 0], lines[n, h, 1], lines[n, h, 2])
-            chi2 = _normal_equations(ya, ga, yb, gb, comb, priors[tried], theta, normal, gradient)
+            chi2 = _normal_equations(ya, wa, yb, wb, comb, priors[tried], theta, normal, gradient)
             chi2s[tried], done[tried] = _improve(
-                ya, ga, yb, gb, comb, priors[tried], theta, chi2, _FIRST_STEPS, normal, gradient, work
+                ya, wa, yb, wb, comb, priors[tried], theta, chi2, _FIRST_STEPS, normal, gradient, work
             )  # fmt: skip
             if chi2s[tried] < math.inf:
                 least = min(least, chi2s[tried])
@@ -264,7 +269,7 @@ def joint_block(
             theta = thetas[h]
             if not done[h]:
                 chi2s[h], _ = _improve(
-                    ya, ga, yb, gb, comb, priors[h], theta, chi2s[h], _STEPS, normals[h], gradients[h], work
+                    ya, wa, yb, wb, comb, priors[h], theta, chi2s[h], _STEPS, normals[h], gradients[h], work
                 )  # fmt: skip
                 least = min(least, chi2s[h])
             if not (low_a <= theta[0] < high_a and low_b <= theta[4] < high_b):

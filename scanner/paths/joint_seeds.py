@@ -2,8 +2,8 @@
 
 One axis, *along*, is that which the epipolar line runs along; the other is *across*. A fit of two paths along, with the
 place across that the line gives to its direct one, is a hypothesis; so is a fit across whose direct path lies near the
-line, with two paths of its amplitudes along. Which distance these have is sought on the moduli alone: |z_t| does not
-depend on where the pair is, and as ||z| - |m|| ≤ |z - m|, what it misses χ² misses at least.
+line, with two paths of its amplitudes along. Which distance these have is sought on the moduli alone, which do not
+depend on where the pair is.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ _APART_PX = 80.0
 """Distances of the paths along the line up to which they are sought with amplitudes from across it, px."""
 _HOPELESS_CHI2 = 60.0
 """χ² above the best from which a distance or a fit across is hopeless."""
-_PAIR_STEPS = 3
+_DISTANCE_STEPS, _PAIR_STEPS = 3, 1
+"""Gauss-Newton steps of a distance, and of a pair of places: all are refined again."""
 _SAME_PX = 2.0
 """Starts this near to each other in all places lead to one and the same fit."""
 
@@ -101,7 +102,7 @@ def _pair_at(
             u1, most = u, s
     u2 = u1 + apart
     v1, v2, chi2 = u1, u2, math.inf
-    for _ in range(_PAIR_STEPS):
+    for _ in range(_PAIR_STEPS + 1):
         # Gauss-Newton, half a radian at most; the last turn only takes χ².
         u1, u2 = v1, v2
         e1, turn1, e2, turn2 = rotation(omega0 * u1), rotation(step * u1), rotation(omega0 * u2), rotation(step * u2)
@@ -126,24 +127,23 @@ def _pair_at(
 
 
 @compiled  # pragma: no cover
-def _distance(moduli: Reals, ga: Reals, comb: Reals, a1: float, a2: float, sigma_a2: float, apart: float) -> Any:
-    """Distance near ``apart`` and second amplitude near a₂ that the moduli of the phasors say, and their χ².
+def _distance(power: Reals, weight: Reals, comb: Reals, a1: float, a2: float, sigma_a2: float, apart: float) -> Any:
+    """Distance near ``apart`` and second amplitude near a₂ that the squared moduli say, and their χ².
 
-    ``sigma_a2`` is the relative standard deviation of the a₂ given.
+    The squares are a₁² + a₂² + 2a₁a₂ cos ω_t d. ``sigma_a2`` is the relative standard deviation of the a₂ given;
+    ``weight`` (T,) one over the variance of ``power``.
     """
     omega0, step = comb[0], comb[1]
     chi2, prior = math.inf, 1 / (sigma_a2 * a2) ** 2
     d, b = apart, a2
-    for k in range(3):
+    for k in range(_DISTANCE_STEPS + 1):
         e, turn = rotation(omega0 * d), rotation(step * d)
-        off = a2 - b
+        off, omega = a2 - b, omega0
         chi2, n11, n12, n22, s1, s2 = prior * off * off, 0.0, 0.0, prior, 0.0, prior * off
-        for t in range(moduli.size):
-            model = math.sqrt(max(a1 * a1 + b * b + 2 * a1 * b * e.real, 1e-6 * a1 * a1))
-            inverse, off = 1 / model, moduli[t] - model
-            by_d = -inverse * a1 * b * (omega0 + t * step) * e.imag
-            by_b = inverse * (b + a1 * e.real)
-            w = ga[t]
+        constant, mixed = a1 * a1 + b * b, 2 * a1 * b
+        for t in range(power.size):
+            w, off = weight[t], power[t] - constant - mixed * e.real
+            by_d, by_b = -mixed * omega * e.imag, 2 * (b + a1 * e.real)
             chi2 += w * off * off
             n11 += w * by_d * by_d
             n12 += w * by_d * by_b
@@ -151,7 +151,8 @@ def _distance(moduli: Reals, ga: Reals, comb: Reals, a1: float, a2: float, sigma
             s1 += w * by_d * off
             s2 += w * by_b * off
             e *= turn
-        if k == 2:
+            omega += step
+        if k == _DISTANCE_STEPS:
             break
         # Where the moduli are extreme they say little of the distance: half a radian at most.
         n11 += 1e-3 * n22 * (a1 * omega0) ** 2
@@ -168,21 +169,23 @@ def _pairs(
 ) -> None:  # fmt: skip
     """Places u₁, u₂ along the line for two paths of amplitudes a₁ and about ``bounce``.
 
-    ``found`` (PAIRS, 4) gets the likeliest: χ², u₁, u₂, a₂. ``left``, ``moduli`` (T,), ``distances`` (PAIRS, 3) are
-    workspace.
+    ``found`` (PAIRS, 4) gets the likeliest: χ², u₁, u₂, a₂. ``left`` (T,), ``moduli`` (2, T), ``distances`` (PAIRS, 3)
+    are workspace.
     """
     middle = ya.size // 2
     fringe = 2 * math.pi / (comb[0] + middle * comb[1])
+    power, weight = moduli[0], moduli[1]
     for t in range(ya.size):
-        moduli[t] = abs(ya[t])
+        square = ya[t].real * ya[t].real + ya[t].imag * ya[t].imag
+        power[t], weight[t] = square - 2 / ga[t], 0.25 * ga[t] / (square + 1 / ga[t])
     for j in range(PAIRS):
         found[j, 0], distances[j, 0] = math.inf, math.inf
     # The modulation in the middle of the comb leaves the distance open by whole fringes, and its sense.
-    cosine = max(-0.95, min((moduli[middle] ** 2 - a1 * a1 - bounce * bounce) / (2 * a1 * bounce), 0.95))
+    cosine = max(-0.95, min((power[middle] - a1 * a1 - bounce * bounce) / (2 * a1 * bounce), 0.95))
     offset = fringe * math.acos(cosine) / (2 * math.pi)
     for number in range(2 * int(_APART_PX / fringe) + 1):
         apart = (number + 1) // 2 * fringe + (-offset if number % 2 else offset)
-        d, a2, chi2 = _distance(moduli, ga, comb, a1, bounce, sigma_bounce, apart)
+        d, a2, chi2 = _distance(power, weight, comb, a1, bounce, sigma_bounce, apart)
         place = PAIRS
         while place > 0 and chi2 < distances[place - 1, 0]:
             place -= 1
@@ -240,7 +243,7 @@ def seed_block(
     """
     count_a, count_b, kinds, kinds_across = za.shape[0], zb.shape[0], fits.shape[0], fits_across.shape[0]
     ya, yb = np.empty(count_a, np.complex128), np.empty(count_b, np.complex128)
-    left, moduli = np.empty(max(count_a, count_b), np.complex128), np.empty(count_a)
+    left, moduli = np.empty(max(count_a, count_b), np.complex128), np.empty((2, count_a))
     ga, gb = np.empty(count_a), np.empty(count_b)
     pairs, distances = np.empty((PAIRS, 4)), np.empty((PAIRS, 3))
     kappa = math.exp(prior[4])

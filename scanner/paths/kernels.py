@@ -31,16 +31,16 @@ _ORDER_REACH = 8.0
 """Fringes to either side of the float solution at most."""
 _ORDER_BEND = 0.2
 """Fringes by which the region widens per fringe from the float solution, because the valley of the likelihood bends."""
-_LOSS_BELIEVED = 0.2
-"""Share of the float solution's quadratic loss that is believed where it says that a pair cannot be among the best."""
+_SLACK_CHI2 = 5.0
+"""χ² by which a pair must promise to fit worse than those kept to be left out untried."""
 _ORDER_PAIRS = 100.0
 """Area of the region at most: one hopeless pixel must not cost the time of a hundred."""
 _REFINED = 3
 """Pairs of orders that are refined to convergence."""
 _CLOSEST_RAD = math.pi / 2
 """Nearer than a quarter fringe, two paths are as good as one."""
-_CONVERGED_CHI2 = 1e-4
-"""A step that lowers χ² by less ends a refinement: it moves no coordinate by more than 1/100 of its σ."""
+_CONVERGED_CHI2 = 1e-2
+"""A step that lowers χ² by less ends a refinement: it moves no coordinate by more than 1/10 of its σ."""
 _REGULAR = 1e-9
 """Floor of a determinant relative to its diagonal."""
 _TINY = 1e-300
@@ -88,6 +88,26 @@ def _float_fit(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float) -> Any:
     d1 = (r1.conjugate() * (f1 - m1 * r2)).imag
     d2 = (r2.conjugate() * (f2 - m1.conjugate() * r1)).imag
     return r1, r2, power, i11, i12, i22, d1, d2
+
+
+@compiled  # pragma: no cover
+def _residues(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float) -> Any:
+    """ρ₁ and ρ₂ of `_float_fit` alone."""
+    dx = xi[1] - xi[0]
+    e1, turn1 = rotation(-xi[0] * v1), rotation(-dx * v1)
+    e2, turn2 = rotation(-xi[0] * v2), rotation(-dx * v2)
+    c1 = c2 = m0 = 0j
+    s0 = 0.0
+    for t in range(y.size):
+        w1 = g[t] * e1
+        c1 += w1 * y[t]
+        c2 += g[t] * (e2 * y[t])
+        m0 += w1 * e2.conjugate()
+        s0 += g[t]
+        e1 *= turn1
+        e2 *= turn2
+    inverse = 1 / max(s0 * s0 - (m0.real**2 + m0.imag**2), _REGULAR * s0 * s0)
+    return inverse * (s0 * c1 - m0 * c2), inverse * (s0 * c2 - m0.conjugate() * c1)
 
 
 @compiled  # pragma: no cover
@@ -293,7 +313,7 @@ def _try_orders(
     determinant = max(i11 * i22 - i12 * i12, _REGULAR * i11 * i22)
     reach = min(_ORDER_CHI2 * scale / cycle**2, _ORDER_PAIRS / math.pi * math.sqrt(determinant))
     for j in range(_REFINED):
-        seeds[j, 0], seeds[j, 3] = math.inf, math.inf
+        seeds[j, 0] = math.inf
     # Of each interval at least the nearest order is tried; from the middle outwards, so that a good fit is found early.
     wide = max(0.5, min(math.sqrt(reach * i22 / determinant), _ORDER_REACH))
     low1, high1 = math.ceil(n1 - wide), math.floor(n1 + wide)
@@ -315,12 +335,12 @@ def _try_orders(
                 continue
             # Real amplitudes fit worse than complex ones: what these lose already is the least that is lost.
             bend = max(abs(k2 - centre) - _ORDER_BEND * abs(k1 - n1), 0.0)
-            if floor + _LOSS_BELIEVED * cycle**2 * (loss + bend**2 * i22) > enough:
+            if floor + cycle**2 * (loss + bend**2 * i22) > enough:
                 continue
             t1, t2 = phase1 + cycle * k1, phase2 + cycle * k2
             if abs(t1 - t2) < _CLOSEST_RAD:
                 continue
-            r1, r2, _, _, _, _, _, _ = _float_fit(y, g, xi, t1, t2)
+            r1, r2 = _residues(y, g, xi, t1, t2)
             t1, t2 = _nearest(t1, r1), _nearest(t2, r2)
             a1, a2, gained, own, mutual, d1, d2, _, _ = _fixed_fit(y, g, xi, t1, t2)
             if gained < 0:
@@ -335,14 +355,12 @@ def _try_orders(
                 place -= 1
             if place < _REFINED:
                 for j in range(_REFINED - 1, place, -1):
-                    for k in range(4):
+                    for k in range(3):
                         seeds[j, k] = seeds[j - 1, k]
-                seeds[place, 0], seeds[place, 3] = cost, total - gained
+                seeds[place, 0] = cost
                 seeds[place, 1] = t1 + shorten * step1 / a1
                 seeds[place, 2] = t2 + shorten * step2 / a2
-                enough = seeds[0, 3]
-                for j in range(1, _REFINED):
-                    enough = max(enough, seeds[j, 3])
+                enough = max(seeds[_REFINED - 1, 0], floor) + _SLACK_CHI2 * scale
     for j in range(_REFINED):
         if not seeds[j, 0] < math.inf:
             break
@@ -398,7 +416,7 @@ def separate_block(
     count, m = z.shape[0], k1.shape[1]
     y, left = np.empty(count, np.complex128), np.empty(count, np.complex128)
     covariance, square, basis = np.empty((m, m)), np.empty((m, m)), np.empty((4, m))
-    seeds, kept = np.empty((_REFINED, 4)), np.empty((CANDIDATES, FIELDS))
+    seeds, kept = np.empty((_REFINED, 3)), np.empty((CANDIDATES, FIELDS))
     dof = 2 * count - 4
     # 1/Δf and the width of a path in the spectrum of the comb, 1/(TΔf), as phases of the carrier.
     period = 2 * math.pi / step_rad
