@@ -2,8 +2,8 @@
 
 A coordinate is carried as the phase v = 2πf_c u (rad) and a frequency as ξ_t = f_t/f_c - 1; the phasors are divided by
 the trend m_t, which leaves the weights g_t = m_t². Amplitudes enter linearly and are eliminated in every fit (variable
-projection, Golub & Pereyra 1973), which leaves 2 x 2 systems in closed form. All kernels live in this one file because
-Numba's cache looks at a kernel's own file only.
+projection, Golub & Pereyra 1973), which leaves 2 x 2 systems in closed form. They live in one file because Numba's
+cache of a kernel looks at its own file only.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.paths.pencil import poles
 from scanner.paths.rotation import compiled, rotation
 
 Floats = NDArray[np.float32]
@@ -43,7 +44,6 @@ _CONVERGED_CHI2 = 1e-2
 """A step that lowers χ² by less ends a refinement: it moves no coordinate by more than 1/10 of its σ."""
 _REGULAR = 1e-9
 """Floor of a determinant relative to its diagonal."""
-_TINY = 1e-300
 _STEPS = 30
 """Levenberg-Marquardt steps at most; two or three are usual."""
 
@@ -198,77 +198,6 @@ def _refine_fixed(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float, toleran
         shorten = 1 / max(1.0, abs(step1), abs(step2))
         t1, t2 = v1 + shorten * step1, v2 + shorten * step2
     return converged, v1, v2, a1, a2, power, own, mutual, own_a, mutual_a
-
-
-@compiled  # pragma: no cover
-def _pencil(y: Phasors, unitary: Phasors, k1: Reals, k2: Reals, c: Reals, c2: Reals, e: Reals) -> Any:
-    """Angles (rad per Δf) of the two strongest poles by unitary ESPRIT; NaN where they do not lie apart on the circle.
-
-    ``c``, ``c2`` (m, m) and ``e`` (4, m) are workspace.
-    """
-    m = unitary.shape[0]
-    for a in range(m):
-        for b in range(m):
-            c[a, b] = 0.0
-    # Forward-backward covariance of the windows of m phasors, which the unitary transform makes real.
-    for j in range(y.size - m + 1):
-        for a in range(m):
-            s = 0j
-            for b in range(m):
-                s += unitary[a, b] * y[j + b]
-            e[0, a], e[1, a] = s.real, s.imag
-        for a in range(m):
-            for b in range(m):
-                c[a, b] += e[0, a] * e[0, b] + e[1, a] * e[1, b]
-    for a in range(m):
-        e[0, a], e[1, a] = c[0, a], c[m - 1, a]
-        for b in range(m):
-            dot = 0.0
-            for k in range(m):
-                dot += c[a, k] * c[k, b]
-            c2[a, b] = dot
-    # Signal subspace: orthogonal iteration on the square of the covariance.
-    for _ in range(5):
-        s1 = s2 = dot = 0.0
-        for a in range(m):
-            n1 = n2 = 0.0
-            for b in range(m):
-                n1 += c2[a, b] * e[0, b]
-                n2 += c2[a, b] * e[1, b]
-            e[2, a], e[3, a] = n1, n2
-            s1 += n1 * n1
-            dot += n1 * n2
-        s1 = 1 / max(s1, _TINY)
-        for a in range(m):
-            e[3, a] -= s1 * dot * e[2, a]
-            s2 += e[3, a] * e[3, a]
-        s1, s2 = math.sqrt(s1), 1 / math.sqrt(max(s2, _TINY))
-        for a in range(m):
-            e[0, a], e[1, a] = s1 * e[2, a], s2 * e[3, a]
-    # Least squares of K₁ E Ω = K₂ E; the eigenvalues of the 2 x 2 matrix Ω are tan(μ/2).
-    n11 = n12 = n22 = o11 = o12 = o21 = o22 = 0.0
-    for a in range(m - 1):
-        p1 = p2 = q1 = q2 = 0.0
-        for b in range(m):
-            p1 += k1[a, b] * e[0, b]
-            p2 += k1[a, b] * e[1, b]
-            q1 += k2[a, b] * e[0, b]
-            q2 += k2[a, b] * e[1, b]
-        n11 += p1 * p1
-        n12 += p1 * p2
-        n22 += p2 * p2
-        o11 += p1 * q1
-        o12 += p1 * q2
-        o21 += p2 * q1
-        o22 += p2 * q2
-    inverse = 1 / max(n11 * n22 - n12 * n12, _TINY)
-    half_trace = 0.5 * inverse * (n22 * o11 - n12 * o21 + n11 * o22 - n12 * o12)
-    determinant = inverse * (o11 * o22 - o12 * o21)
-    spread = half_trace**2 - determinant
-    if not spread > 0:
-        return 2 * math.atan(half_trace), math.nan
-    spread = math.sqrt(spread)
-    return 2 * math.atan(half_trace - spread), 2 * math.atan(half_trace + spread)
 
 
 @compiled  # pragma: no cover
@@ -432,7 +361,7 @@ def separate_block(
             continue
         for k in range(CANDIDATES):
             kept[k, 0], kept[k, 1], kept[k, 2], kept[k, 3], kept[k, 4] = math.inf, math.nan, math.nan, 1.0, 1.0
-        pole1, pole2 = _pencil(y, unitary, k1, k2, covariance, square, basis)
+        pole1, pole2 = poles(y, unitary, k1, k2, covariance, square, basis)
         # Of the places that a pole may stand for, the one nearest to the middle of the picture.
         v1 = middle + period * ((pole1 / (2 * math.pi) - middle / period + 0.5) % 1 - 0.5)
         v2 = middle + period * ((pole2 / (2 * math.pi) - middle / period + 0.5) % 1 - 0.5)
