@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drivers.errors import OperatorError
 from scanner.paths.kernels import Phasors, Reals
+from scanner.paths.pencil import unitary_esprit
 
 
 class SeparationPlanError(OperatorError):
@@ -92,24 +93,3 @@ def prepare(
             pencil=unitary_esprit(f.size // 2 + 1),
         ),
     )
-
-
-def unitary_esprit(m: int) -> tuple[Phasors, Reals, Reals]:
-    """Transform Qᴴ (m, m) that makes a forward-backward covariance real, and the matrices K₁, K₂ (m - 1, m) for poles.
-
-    For the signal subspace E and a pole e^{iμ}: K₁ E tan(μ/2) = K₂ E.
-    """
-
-    def transform(size: int) -> Phasors:
-        half = size // 2
-        eye, flip = np.eye(half), np.eye(half)[::-1]
-        q = np.zeros((size, size), np.complex128)
-        q[:half, :half], q[:half, size - half :] = eye, 1j * eye
-        q[size - half :, :half], q[size - half :, size - half :] = flip, -1j * flip
-        if size % 2:
-            q[half, half] = math.sqrt(2)
-        return np.ascontiguousarray(q.conj().T) / math.sqrt(2)
-
-    unitary = transform(m)
-    shifted = transform(m - 1) @ np.eye(m)[1:] @ unitary.conj().T
-    return unitary, np.ascontiguousarray(shifted.real), np.ascontiguousarray(shifted.imag)

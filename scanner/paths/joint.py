@@ -27,6 +27,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from scanner.paths.comb import prepare
 from scanner.paths.joint_kernels import FIELDS, ROWS, joint_block
+from scanner.paths.joint_seeds import PAIRS, seed_block
 from scanner.paths.kernels import Floats
 from scanner.paths.separation import CORES, separate_candidates
 from scanner.patterns import Axis
@@ -213,6 +214,13 @@ def separate_jointly(
     ------
     SeparationPlanError
         As `scanner.paths.separate_two_paths`.
+
+    Notes
+    -----
+    The search is not exhaustive: where σ is 10 DN and the paths are 20-60 px apart along the line it returns the direct
+    path in 95.6-96.1 % of pixels, and in 98.3 % when the true paths are among its starts as well, which bounds maximum
+    likelihood from above. With six fits kept per axis it gains 1 %, for a third more time. Two thirds of
+    what it loses lie closer than 60 px on both axes.
     """
     along: Axis = _along(rig)
     across: Axis = "y" if along == "x" else "x"
@@ -228,36 +236,44 @@ def separate_jointly(
     comb = np.array([*comb_a.start_and_step, *comb_b.start_and_step])
     dof = 2 * (len(a.frequency) + len(b.frequency)) - 8 + PRIORS
 
-    def decide(these: NDArray[np.intp] | slice, fits_across: Floats) -> None:
+    def decide(these: NDArray[np.intp], fits_across: Floats) -> None:
+        if not these.size:
+            return
         z1, z2, s1, s2, first, place, rise = (_taken(v, these) for v in (za, zb, sigma_a, sigma_b, fits, other, slope))
-        found = np.full((ROWS, s1.size), np.nan, np.float32)
+        found = np.full((ROWS, these.size), np.nan, np.float32)
+        most = 2 * len(fits) + 2 * PAIRS * len(fits_across)
 
         def joint(start: int) -> None:
-            joint_block(
-                z1, z2, s1, s2, comb_a.gain, comb_b.gain, comb, -0.5, a.extent - 0.5, -0.5, b.extent - 0.5, first,
-                place, rise, fits_across, prior, LARGER_IS_DIRECT, found, start, min(start + _BLOCK, s1.size),
+            count = min(_BLOCK, these.size - start)
+            data = (
+                z1, z2, s1, s2, comb_a.gain, comb_b.gain, comb, -0.5, a.extent - 0.5, -0.5, b.extent - 0.5,
             )  # fmt: skip
+            seeds, lines, bounds = np.empty((count, most, 8)), np.empty((count, most, 3)), np.empty((count, most))
+            seed_block(*data, first, place, rise, fits_across, prior, start, seeds, lines, bounds)
+            joint_block(*data, seeds, lines, bounds, prior, LARGER_IS_DIRECT, found, start)
 
         with ThreadPoolExecutor(CORES) as pool:
-            list(pool.map(joint, range(0, s1.size, _BLOCK)))
+            list(pool.map(joint, range(0, these.size, _BLOCK)))
         out[:, these] = found
 
-    decide(slice(None), np.empty((0, *fits.shape[1:]), np.float32))
-    confidence, chi2 = out[2 * FIELDS], out[FIELDS - 1]
-    sure = (confidence > _SURE) & (chi2 < dof + _SURE_SIGMAS * math.sqrt(2 * dof))
-    doubtful = np.flatnonzero(~(sure & (np.abs(out[0] - out[1]) > _CLOSE_PX)))
+    def ask_across(these: NDArray[np.intp]) -> None:
+        fits_across = separate_candidates(b.z[:, these], b.frequency, b.sigma_z[these], b.extent, b.gain)
+        decide(these, fits_across)
+        third[these] |= _too_many(fits_across, len(b.frequency))
+
     third = _too_many(fits, len(a.frequency))
-    if doubtful.size:
-        again = separate_candidates(b.z[:, doubtful], b.frequency, b.sigma_z[doubtful], b.extent, b.gain)
-        decide(doubtful, again)
-        third[doubtful] |= _too_many(again, len(b.frequency))
+    far = np.abs(fits[0, 0] - fits[0, 1]) > _CLOSE_PX
+    decide(np.flatnonzero(far), np.empty((0, *fits.shape[1:]), np.float32))
+    confidence, chi2 = out[2 * FIELDS], out[FIELDS - 1]
+    sure = far & (confidence > _SURE) & (chi2 < dof + _SURE_SIGMAS * math.sqrt(2 * dof))
+    ask_across(np.flatnonzero(~(sure & (np.abs(out[0] - out[1]) > _CLOSE_PX))))
     order = [0, 1] if along == "x" else [1, 0]
     best, rival = (_pair(out[k * FIELDS : (k + 1) * FIELDS], order) for k in range(2))
     fits_together = best.chi2 < chi2_distribution.isf(1 / REFUSED_ONE_IN, dof)
     return DirectPaths(best, rival, confidence, third & ~fits_together, dof, order[0])
 
 
-def _taken(values: NDArray[Any], these: NDArray[np.intp] | slice) -> Any:
+def _taken(values: NDArray[Any], these: NDArray[np.intp]) -> Any:
     """Some pixels of (…, P) values, contiguous as the kernel wants them."""
     return np.ascontiguousarray(values[..., these])
 
@@ -282,7 +298,7 @@ def _along(rig: Rig) -> Axis:
 
 
 def compile_all() -> None:
-    """Compile the joint kernel into Numba's cache, so that no scan waits for it."""
+    """Compile the joint kernels into Numba's cache, so that no scan waits for it."""
     lens = Lens(np.eye(3), np.empty(0), (2, 1))
     rig = Rig(lens, lens, np.eye(3), np.array([1.0, 0.0, 0.0]))
     frequency = np.arange(80, 89) / 1280

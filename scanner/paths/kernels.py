@@ -2,8 +2,8 @@
 
 A coordinate is carried as the phase v = 2πf_c u (rad) and a frequency as ξ_t = f_t/f_c - 1; the phasors are divided by
 the trend m_t, which leaves the weights g_t = m_t². Amplitudes enter linearly and are eliminated in every fit (variable
-projection, Golub & Pereyra 1973), which leaves 2 x 2 systems in closed form. All kernels live in this one file because
-Numba's cache looks at a kernel's own file only.
+projection, Golub & Pereyra 1973), which leaves 2 x 2 systems in closed form. They live in one file because Numba's
+cache of a kernel looks at its own file only.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from scanner.paths.pencil import poles
+from scanner.paths.rotation import compiled, rotation
 
 Floats = NDArray[np.float32]
 Reals = NDArray[np.float64]
@@ -30,30 +32,23 @@ _ORDER_REACH = 8.0
 """Fringes to either side of the float solution at most."""
 _ORDER_BEND = 0.2
 """Fringes by which the region widens per fringe from the float solution, because the valley of the likelihood bends."""
+_SLACK_CHI2 = 5.0
+"""χ² by which a pair must promise to fit worse than those kept to be left out untried."""
 _ORDER_PAIRS = 100.0
 """Area of the region at most: one hopeless pixel must not cost the time of a hundred."""
 _REFINED = 3
 """Pairs of orders that are refined to convergence."""
 _CLOSEST_RAD = math.pi / 2
 """Nearer than a quarter fringe, two paths are as good as one."""
-_CONVERGED_CHI2 = 1e-4
-"""A step that lowers χ² by less ends a refinement: it moves no coordinate by more than 1/100 of its σ."""
+_CONVERGED_CHI2 = 1e-2
+"""A step that lowers χ² by less ends a refinement: it moves no coordinate by more than 1/10 of its σ."""
 _REGULAR = 1e-9
 """Floor of a determinant relative to its diagonal."""
-_TINY = 1e-300
 _STEPS = 30
 """Levenberg-Marquardt steps at most; two or three are usual."""
 
-# NaN and infinity keep their meaning.
-_compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 
-
-@_compiled  # pragma: no cover
-def _turn(angle: float) -> complex:
-    return complex(math.cos(angle), math.sin(angle))
-
-
-@_compiled  # pragma: no cover
+@compiled  # pragma: no cover
 def _float_fit(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float) -> Any:
     """Least squares of y_t = ρ₁ e^{iξ_t v₁} + ρ₂ e^{iξ_t v₂} with complex ρ, for weights g.
 
@@ -61,7 +56,7 @@ def _float_fit(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float) -> Any:
     half the power.
     """
     dx = xi[1] - xi[0]
-    e1, turn1, e2, turn2 = _turn(xi[0] * v1), _turn(dx * v1), _turn(xi[0] * v2), _turn(dx * v2)
+    e1, turn1, e2, turn2 = rotation(xi[0] * v1), rotation(dx * v1), rotation(xi[0] * v2), rotation(dx * v2)
     c1 = c2 = f1 = f2 = m0 = m1 = m2 = 0j
     s0 = s2 = 0.0
     for t in range(y.size):
@@ -95,7 +90,27 @@ def _float_fit(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float) -> Any:
     return r1, r2, power, i11, i12, i22, d1, d2
 
 
-@_compiled  # pragma: no cover
+@compiled  # pragma: no cover
+def _residues(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float) -> Any:
+    """ρ₁ and ρ₂ of `_float_fit` alone."""
+    dx = xi[1] - xi[0]
+    e1, turn1 = rotation(-xi[0] * v1), rotation(-dx * v1)
+    e2, turn2 = rotation(-xi[0] * v2), rotation(-dx * v2)
+    c1 = c2 = m0 = 0j
+    s0 = 0.0
+    for t in range(y.size):
+        w1 = g[t] * e1
+        c1 += w1 * y[t]
+        c2 += g[t] * (e2 * y[t])
+        m0 += w1 * e2.conjugate()
+        s0 += g[t]
+        e1 *= turn1
+        e2 *= turn2
+    inverse = 1 / max(s0 * s0 - (m0.real**2 + m0.imag**2), _REGULAR * s0 * s0)
+    return inverse * (s0 * c1 - m0 * c2), inverse * (s0 * c2 - m0.conjugate() * c1)
+
+
+@compiled  # pragma: no cover
 def _fixed_fit(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float) -> Any:
     """Least squares of y_t = a₁ e^{i(1+ξ_t)v₁} + a₂ e^{i(1+ξ_t)v₂} with real a, for weights g.
 
@@ -104,7 +119,7 @@ def _fixed_fit(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float) -> Any:
     (a₁, a₂).
     """
     dx, x = xi[1] - xi[0], 1 + xi[0]
-    e1, turn1, e2, turn2 = _turn(x * v1), _turn(dx * v1), _turn(x * v2), _turn(dx * v2)
+    e1, turn1, e2, turn2 = rotation(x * v1), rotation(dx * v1), rotation(x * v2), rotation(dx * v2)
     c1 = c2 = f1 = f2 = m0 = m1 = m2 = s0 = s2 = 0.0
     for t in range(y.size):
         q1, q2, p = e1.conjugate() * y[t], e2.conjugate() * y[t], e1.conjugate() * e2
@@ -133,7 +148,7 @@ def _fixed_fit(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float) -> Any:
     )  # fmt: skip
 
 
-@_compiled  # pragma: no cover
+@compiled  # pragma: no cover
 def _refine_float(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float, limit: float) -> Any:
     """Gauss-Newton on `_float_fit`, at most ``limit`` rad a step; returns v₁, v₂, ρ₁, ρ₂, power and information."""
     r1 = r2 = 0j
@@ -156,7 +171,7 @@ def _refine_float(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float, limit: 
     return v1, v2, r1, r2, power, i11, i12, i22
 
 
-@_compiled  # pragma: no cover
+@compiled  # pragma: no cover
 def _refine_fixed(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float, tolerance: float) -> Any:
     """Levenberg-Marquardt on `_fixed_fit`.
 
@@ -185,78 +200,7 @@ def _refine_fixed(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float, toleran
     return converged, v1, v2, a1, a2, power, own, mutual, own_a, mutual_a
 
 
-@_compiled  # pragma: no cover
-def _pencil(y: Phasors, unitary: Phasors, k1: Reals, k2: Reals, c: Reals, c2: Reals, e: Reals) -> Any:
-    """Angles (rad per Δf) of the two strongest poles by unitary ESPRIT; NaN where they do not lie apart on the circle.
-
-    ``c``, ``c2`` (m, m) and ``e`` (4, m) are workspace.
-    """
-    m = unitary.shape[0]
-    for a in range(m):
-        for b in range(m):
-            c[a, b] = 0.0
-    # Forward-backward covariance of the windows of m phasors, which the unitary transform makes real.
-    for j in range(y.size - m + 1):
-        for a in range(m):
-            s = 0j
-            for b in range(m):
-                s += unitary[a, b] * y[j + b]
-            e[0, a], e[1, a] = s.real, s.imag
-        for a in range(m):
-            for b in range(m):
-                c[a, b] += e[0, a] * e[0, b] + e[1, a] * e[1, b]
-    for a in range(m):
-        e[0, a], e[1, a] = c[0, a], c[m - 1, a]
-        for b in range(m):
-            dot = 0.0
-            for k in range(m):
-                dot += c[a, k] * c[k, b]
-            c2[a, b] = dot
-    # Signal subspace: orthogonal iteration on the square of the covariance.
-    for _ in range(5):
-        s1 = s2 = dot = 0.0
-        for a in range(m):
-            n1 = n2 = 0.0
-            for b in range(m):
-                n1 += c2[a, b] * e[0, b]
-                n2 += c2[a, b] * e[1, b]
-            e[2, a], e[3, a] = n1, n2
-            s1 += n1 * n1
-            dot += n1 * n2
-        s1 = 1 / max(s1, _TINY)
-        for a in range(m):
-            e[3, a] -= s1 * dot * e[2, a]
-            s2 += e[3, a] * e[3, a]
-        s1, s2 = math.sqrt(s1), 1 / math.sqrt(max(s2, _TINY))
-        for a in range(m):
-            e[0, a], e[1, a] = s1 * e[2, a], s2 * e[3, a]
-    # Least squares of K₁ E Ω = K₂ E; the eigenvalues of the 2 x 2 matrix Ω are tan(μ/2).
-    n11 = n12 = n22 = o11 = o12 = o21 = o22 = 0.0
-    for a in range(m - 1):
-        p1 = p2 = q1 = q2 = 0.0
-        for b in range(m):
-            p1 += k1[a, b] * e[0, b]
-            p2 += k1[a, b] * e[1, b]
-            q1 += k2[a, b] * e[0, b]
-            q2 += k2[a, b] * e[1, b]
-        n11 += p1 * p1
-        n12 += p1 * p2
-        n22 += p2 * p2
-        o11 += p1 * q1
-        o12 += p1 * q2
-        o21 += p2 * q1
-        o22 += p2 * q2
-    inverse = 1 / max(n11 * n22 - n12 * n12, _TINY)
-    half_trace = 0.5 * inverse * (n22 * o11 - n12 * o21 + n11 * o22 - n12 * o12)
-    determinant = inverse * (o11 * o22 - o12 * o21)
-    spread = half_trace**2 - determinant
-    if not spread > 0:
-        return 2 * math.atan(half_trace), math.nan
-    spread = math.sqrt(spread)
-    return 2 * math.atan(half_trace - spread), 2 * math.atan(half_trace + spread)
-
-
-@_compiled  # pragma: no cover
+@compiled  # pragma: no cover
 def _strongest(y: Phasors, g: Reals, xi: Reals, low: float, high: float, step: float) -> Any:
     """Of v = low, low + step, … < high the one where y holds most of one path, and the path's complex amplitude."""
     dx = xi[1] - xi[0]
@@ -265,7 +209,7 @@ def _strongest(y: Phasors, g: Reals, xi: Reals, low: float, high: float, step: f
         s0 += g[t]
     for k in range(int((high - low) / step) + 1):
         v = low + k * step
-        e, turn = _turn(-xi[0] * v), _turn(-dx * v)
+        e, turn = rotation(-xi[0] * v), rotation(-dx * v)
         c = 0j
         for t in range(y.size):
             c += g[t] * (e * y[t])
@@ -276,14 +220,14 @@ def _strongest(y: Phasors, g: Reals, xi: Reals, low: float, high: float, step: f
     return place, residue
 
 
-@_compiled  # pragma: no cover
+@compiled  # pragma: no cover
 def _nearest(v: float, r: complex) -> float:
     """The coordinate nearest to v whose phase is that of the residue r."""
     off = math.atan2(r.imag, r.real) - v
     return v + off - 2 * math.pi * round(off / (2 * math.pi))
 
 
-@_compiled  # pragma: no cover
+@compiled  # pragma: no cover
 def _try_orders(
     y: Phasors, g: Reals, xi: Reals, total: float, variance: float, solution: Any, turn: float, low: float, high: float,
     seeds: Reals, kept: Reals,
@@ -299,26 +243,42 @@ def _try_orders(
     reach = min(_ORDER_CHI2 * scale / cycle**2, _ORDER_PAIRS / math.pi * math.sqrt(determinant))
     for j in range(_REFINED):
         seeds[j, 0] = math.inf
-    # Of each interval at least the nearest order is tried.
+    # Of each interval at least the nearest order is tried; from the middle outwards, so that a good fit is found early.
     wide = max(0.5, min(math.sqrt(reach * i22 / determinant), _ORDER_REACH))
-    for k1 in range(math.ceil(n1 - wide), math.floor(n1 + wide) + 1):
+    low1, high1 = math.ceil(n1 - wide), math.floor(n1 + wide)
+    middle1 = min(max(round(n1), low1), high1)
+    floor, enough = total - power, math.inf
+    for j1 in range(2 * max(middle1 - low1, high1 - middle1) + 1):
+        k1 = middle1 + (-(j1 // 2) if j1 % 2 == 0 else (j1 + 1) // 2)
+        if k1 < low1 or k1 > high1:
+            continue
         centre = n2 - i12 / i22 * (k1 - n1)
-        rest = max(reach - (k1 - n1) ** 2 * determinant / i22, 0.0)
+        loss = (k1 - n1) ** 2 * determinant / i22
+        rest = max(reach - loss, 0.0)
         narrow = max(0.5, min(math.sqrt(rest / i22), _ORDER_REACH)) + _ORDER_BEND * abs(k1 - n1)
-        for k2 in range(math.ceil(centre - narrow), math.floor(centre + narrow) + 1):
+        low2, high2 = math.ceil(centre - narrow), math.floor(centre + narrow)
+        middle2 = min(max(round(centre), low2), high2)
+        for j2 in range(2 * max(middle2 - low2, high2 - middle2) + 1):
+            k2 = middle2 + (-(j2 // 2) if j2 % 2 == 0 else (j2 + 1) // 2)
+            if k2 < low2 or k2 > high2:
+                continue
+            # Real amplitudes fit worse than complex ones: what these lose already is the least that is lost.
+            bend = max(abs(k2 - centre) - _ORDER_BEND * abs(k1 - n1), 0.0)
+            if floor + cycle**2 * (loss + bend**2 * i22) > enough:
+                continue
             t1, t2 = phase1 + cycle * k1, phase2 + cycle * k2
             if abs(t1 - t2) < _CLOSEST_RAD:
                 continue
-            r1, r2, _, _, _, _, _, _ = _float_fit(y, g, xi, t1, t2)
+            r1, r2 = _residues(y, g, xi, t1, t2)
             t1, t2 = _nearest(t1, r1), _nearest(t2, r2)
-            a1, a2, power, own, mutual, d1, d2, _, _ = _fixed_fit(y, g, xi, t1, t2)
-            if power < 0:
+            a1, a2, gained, own, mutual, d1, d2, _, _ = _fixed_fit(y, g, xi, t1, t2)
+            if gained < 0:
                 continue
             # What one Gauss-Newton step, of at most one radian, promises to gain.
             inverse = 1 / max(own * own - mutual * mutual, _REGULAR * own * own)
             step1, step2 = inverse * (own * d1 - mutual * d2), inverse * (own * d2 - mutual * d1)
             shorten = 1 / max(1.0, abs(step1) / a1, abs(step2) / a2)
-            cost = total - power - shorten * (step1 * d1 + step2 * d2)
+            cost = total - gained - shorten * (step1 * d1 + step2 * d2)
             place = _REFINED
             while place > 0 and cost < seeds[place - 1, 0]:
                 place -= 1
@@ -329,6 +289,7 @@ def _try_orders(
                 seeds[place, 0] = cost
                 seeds[place, 1] = t1 + shorten * step1 / a1
                 seeds[place, 2] = t2 + shorten * step2 / a2
+                enough = max(seeds[_REFINED - 1, 0], floor) + _SLACK_CHI2 * scale
     for j in range(_REFINED):
         if not seeds[j, 0] < math.inf:
             break
@@ -350,7 +311,7 @@ def _try_orders(
         _keep(kept, score, t1, t2, a1, a2, var_v, var_a)
 
 
-@_compiled  # pragma: no cover
+@compiled  # pragma: no cover
 def _keep(
     kept: Reals, score: float, v1: float, v2: float, a1: float, a2: float, var_v: float, var_a: float
 ) -> None:  # fmt: skip
@@ -375,7 +336,7 @@ def _keep(
     kept[place, 4], kept[place, 5], kept[place, 6] = a2, var_v, var_a
 
 
-@_compiled  # pragma: no cover
+@compiled  # pragma: no cover
 def separate_block(
     z: NDArray[np.complex64], sigma: Reals, gain: Reals, g: Reals, xi: Reals, unitary: Phasors, k1: Reals, k2: Reals,
     carrier: float, step_rad: float, turn: float, low: float, high: float, found: Floats, start: int, stop: int,
@@ -400,7 +361,7 @@ def separate_block(
             continue
         for k in range(CANDIDATES):
             kept[k, 0], kept[k, 1], kept[k, 2], kept[k, 3], kept[k, 4] = math.inf, math.nan, math.nan, 1.0, 1.0
-        pole1, pole2 = _pencil(y, unitary, k1, k2, covariance, square, basis)
+        pole1, pole2 = poles(y, unitary, k1, k2, covariance, square, basis)
         # Of the places that a pole may stand for, the one nearest to the middle of the picture.
         v1 = middle + period * ((pole1 / (2 * math.pi) - middle / period + 0.5) % 1 - 0.5)
         v2 = middle + period * ((pole2 / (2 * math.pi) - middle / period + 0.5) % 1 - 0.5)
@@ -416,7 +377,7 @@ def separate_block(
             if attempt == 1:
                 v1, r = _strongest(y, g, xi, low, high, resolution / 8)
                 for t in range(count):
-                    left[t] = y[t] - r * _turn(xi[t] * v1)
+                    left[t] = y[t] - r * rotation(xi[t] * v1)
                 v2, _ = _strongest(left, g, xi, low, high, resolution / 8)
             solution = _refine_float(y, g, xi, v1, v2, 0.1 * resolution)
             _try_orders(y, g, xi, total, variance, solution, turn, low, high, seeds, kept)

@@ -54,4 +54,6 @@ def test_a_hundred_thousand_pixels_on_both_axes(sigma, capsys):
             for low, high in ((0.05, 0.4), (0.4, 0.8), (0.8, 1.2), (1.2, 1.5)):
                 some = (s.alpha >= low) & (s.alpha < high)
                 print(f"  α = {low:g}–{high:g}: direct path {interval(right[some])}")
-        assert right.mean() > 0.9
+        assert right.mean() > 0.945
+        # 2 s on two cores; by CPU, because another program on the machine is not the separation's fault.
+        assert cpu / 2 < (2.0 if (sigma, near) != (10, 20) else 2.6)

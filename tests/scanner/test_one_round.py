@@ -10,6 +10,7 @@ import pytest
 
 from scanner.methods.separated import Separated
 from scanner.methods.sufficiency import Evidence, weigh
+from scanner.result import Flag
 
 _rng = np.random.default_rng(27182)
 CAMERA = {"width_px": 192, "height_px": 144}
@@ -52,6 +53,23 @@ def test_one_round_within_a_tenth_of_a_pixel(scan_simulated, name):
     # NaN is not within.
     assert (error < 0.1).mean() >= 0.95
     assert (error > 4).mean() <= 0.002
+
+
+def test_a_part_brighter_by_its_bounce_is_given_a_second_round(scan_simulated):
+    # The part shows the board twice: by the projector's light, and by what it throws there itself. Two paths fit badly.
+    scene = {"name": "polished", "mirror_angle_deg": float(_rng.uniform(97, 106)), "mirror_roughness": 0.0}
+    maps, truth = scan_simulated(
+        scene, options={"rounds": "auto"}, seed=6, camera=CAMERA, transport={"photons": 300_000}
+    )
+    with np.errstate(invalid="ignore"):
+        stronger = (truth.alpha > 1) & np.isfinite(truth.x_p) & ~truth.edge
+    assert stronger.sum() > 500
+    assert maps.lit is not None
+    flagged = (maps.flags & (Flag.THIRD_PATH | Flag.MISFIT | Flag.OFF_EPIPOLAR | Flag.NOT_LIT)) != 0
+    assert (flagged | np.isfinite(maps.x_p))[stronger & maps.interreflection].all()
+    assert ((maps.flags & Flag.THIRD_PATH) != 0)[stronger].mean() > 0.2
+    # The bounce is not returned for the direct light, though it is the brighter of the two.
+    assert (np.abs(maps.x_p - truth.bounce_x)[stronger] < 4).mean() <= 0.01
 
 
 def region_of(count=400, **changes):

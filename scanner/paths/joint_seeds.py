@@ -1,0 +1,309 @@
+"""Where the joint separation starts: hypotheses of both paths on both axes; see `scanner.paths.joint`.
+
+One axis, *along*, is that which the epipolar line runs along; the other is *across*. A fit of two paths along, with the
+place across that the line gives to its direct one, is a hypothesis; so is a fit across whose direct path lies near the
+line, with two paths of its amplitudes along. Which distance these have is sought on the moduli alone, which do not
+depend on where the pair is.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.paths.rotation import compiled, rotation
+
+Floats = NDArray[np.float32]
+Reals = NDArray[np.float64]
+Phasors = NDArray[np.complex128]
+
+PAIRS = 4
+"""Pairs of places along the line that are kept of those with the amplitudes of one fit across."""
+_ORDERS = 2
+"""Fringe orders tried to either side of what the pole of the rest says."""
+_NEAR_LINE_PX, _NEAR_LINE_SIGMAS = 3.0, 6.0
+"""How far from the line a fit of the axis across may lie and still be tried."""
+_APART_PX = 80.0
+"""Distances of the paths along the line up to which they are sought with amplitudes from across it, px."""
+_HOPELESS_CHI2 = 60.0
+"""χ² above the best from which a distance or a fit across is hopeless."""
+_DISTANCE_STEPS, _PAIR_STEPS = 3, 1
+"""Gauss-Newton steps of a distance, and of a pair of places: all are refined again."""
+_SAME_PX = 2.0
+"""Starts this near to each other in all places lead to one and the same fit."""
+
+
+@compiled  # pragma: no cover
+def _rest(zb: Phasors, gb: Reals, comb: Reals, u1: float, a1: float, low: float, high: float, left: Phasors) -> Any:
+    """Place and amplitude of the one path in what the path (u₁, a₁) leaves of an axis; amplitude 0 where none is."""
+    omega0, step = comb[2], comb[3]
+    e, turn = rotation(omega0 * u1), rotation(step * u1)
+    lag, total = 0j, 0.0
+    for t in range(zb.size):
+        left[t] = zb[t] - a1 * e
+        total += gb[t]
+        if t > 0:
+            lag += gb[t] * (left[t] * left[t - 1].conjugate())
+        e *= turn
+    period = 2 * math.pi / step
+    coarse = math.atan2(lag.imag, lag.real) / step
+    coarse -= period * math.floor((coarse - 0.5 * (low + high)) / period + 0.5)
+    centre = omega0 + 0.5 * (zb.size - 1) * step
+    e, turn, c = rotation(-omega0 * coarse), rotation(-step * coarse), 0j
+    for t in range(zb.size):
+        c += gb[t] * (e * left[t])
+        e *= turn
+    fine = coarse + math.atan2(c.imag, c.real) / centre
+    place, most = fine, 0.0
+    for k in range(-_ORDERS, _ORDERS + 1):
+        u = fine + k * 2 * math.pi / centre
+        if not (low <= u < high):
+            continue
+        e, turn, s = rotation(-omega0 * u), rotation(-step * u), 0.0
+        for t in range(zb.size):
+            s += gb[t] * (e * left[t]).real
+            e *= turn
+        if s > most:
+            place, most = u, s
+    return place, most / total
+
+
+@compiled  # pragma: no cover
+def _pair_at(
+    ya: Phasors, ga: Reals, comb: Reals, a1: float, a2: float, apart: float, low: float, high: float, left: Phasors
+) -> Any:  # fmt: skip
+    """Places of two paths of known amplitudes that are about ``apart`` from each other, and their χ²."""
+    omega0, step = comb[0], comb[1]
+    centre, period = omega0 + 0.5 * (ya.size - 1) * step, 2 * math.pi / step
+    e, turn, lag = rotation(omega0 * apart), rotation(step * apart), 0j
+    for t in range(ya.size):
+        left[t] = ya[t] * (a1 + a2 * e).conjugate()
+        if t > 0:
+            lag += ga[t] * (left[t] * left[t - 1].conjugate())
+        e *= turn
+    coarse = math.atan2(lag.imag, lag.real) / step
+    coarse -= period * math.floor((coarse - 0.5 * (low + high)) / period + 0.5)
+    e, turn, c = rotation(-omega0 * coarse), rotation(-step * coarse), 0j
+    for t in range(ya.size):
+        c += ga[t] * (e * left[t])
+        e *= turn
+    fine = coarse + math.atan2(c.imag, c.real) / centre
+    u1, most = fine, -math.inf
+    for k in range(-1, 2):
+        u = fine + k * 2 * math.pi / centre
+        e, turn, s = rotation(-omega0 * u), rotation(-step * u), 0.0
+        for t in range(ya.size):
+            s += ga[t] * (e * left[t]).real
+            e *= turn
+        if s > most and low <= u < high:
+            u1, most = u, s
+    u2 = u1 + apart
+    v1, v2, chi2 = u1, u2, math.inf
+    for _ in range(_PAIR_STEPS + 1):
+        # Gauss-Newton, half a radian at most; the last turn only takes χ².
+        u1, u2 = v1, v2
+        e1, turn1, e2, turn2 = rotation(omega0 * u1), rotation(step * u1), rotation(omega0 * u2), rotation(step * u2)
+        chi2 = n11 = n12 = n22 = s1 = s2 = 0.0
+        for t in range(ya.size):
+            off, w, omega = ya[t] - a1 * e1 - a2 * e2, ga[t], omega0 + t * step
+            chi2 += w * (off.real * off.real + off.imag * off.imag)
+            w *= omega
+            s1 += w * a1 * (e1.conjugate() * off).imag
+            s2 += w * a2 * (e2.conjugate() * off).imag
+            w *= omega
+            n11 += w * a1 * a1
+            n22 += w * a2 * a2
+            n12 += w * a1 * a2 * (e1.conjugate() * e2).real
+            e1 *= turn1
+            e2 *= turn2
+        inverse = 1 / (n11 * n22 * (1 + 1e-3) - n12 * n12)
+        d1, d2 = inverse * (n22 * s1 - n12 * s2), inverse * (n11 * s2 - n12 * s1)
+        shorten = 1 / max(1.0, 2 * omega0 * max(abs(d1), abs(d2)))
+        v1, v2 = u1 + shorten * d1, u2 + shorten * d2
+    return u1, u2, chi2
+
+
+@compiled  # pragma: no cover
+def _distance(power: Reals, weight: Reals, comb: Reals, a1: float, a2: float, sigma_a2: float, apart: float) -> Any:
+    """Distance near ``apart`` and second amplitude near a₂ that the squared moduli say, and their χ².
+
+    The squares are a₁² + a₂² + 2a₁a₂ cos ω_t d. ``sigma_a2`` is the relative standard deviation of the a₂ given;
+    ``weight`` (T,) one over the variance of ``power``.
+    """
+    omega0, step = comb[0], comb[1]
+    chi2, prior = math.inf, 1 / (sigma_a2 * a2) ** 2
+    d, b = apart, a2
+    for k in range(_DISTANCE_STEPS + 1):
+        e, turn = rotation(omega0 * d), rotation(step * d)
+        off, omega = a2 - b, omega0
+        chi2, n11, n12, n22, s1, s2 = prior * off * off, 0.0, 0.0, prior, 0.0, prior * off
+        constant, mixed = a1 * a1 + b * b, 2 * a1 * b
+        for t in range(power.size):
+            w, off = weight[t], power[t] - constant - mixed * e.real
+            by_d, by_b = -mixed * omega * e.imag, 2 * (b + a1 * e.real)
+            chi2 += w * off * off
+            n11 += w * by_d * by_d
+            n12 += w * by_d * by_b
+            n22 += w * by_b * by_b
+            s1 += w * by_d * off
+            s2 += w * by_b * off
+            e *= turn
+            omega += step
+        if k == _DISTANCE_STEPS:
+            break
+        # Where the moduli are extreme they say little of the distance: half a radian at most.
+        n11 += 1e-3 * n22 * (a1 * omega0) ** 2
+        inverse = 1 / (n11 * n22 - n12 * n12)
+        d += max(-0.5 / omega0, min(inverse * (n22 * s1 - n12 * s2), 0.5 / omega0))
+        b = max(0.5 * b, min(b + inverse * (n11 * s2 - n12 * s1), 2 * b))
+    return d, b, chi2
+
+
+@compiled  # pragma: no cover
+def _pairs(
+    ya: Phasors, ga: Reals, comb: Reals, a1: float, bounce: float, sigma_bounce: float, low: float, high: float,
+    left: Phasors, moduli: Reals, distances: Reals, found: Reals,
+) -> None:  # fmt: skip
+    """Places u₁, u₂ along the line for two paths of amplitudes a₁ and about ``bounce``.
+
+    ``found`` (PAIRS, 4) gets the likeliest: χ², u₁, u₂, a₂. ``left`` (T,), ``moduli`` (2, T), ``distances`` (PAIRS, 3)
+    are workspace.
+    """
+    middle = ya.size // 2
+    fringe = 2 * math.pi / (comb[0] + middle * comb[1])
+    power, weight = moduli[0], moduli[1]
+    for t in range(ya.size):
+        square = ya[t].real * ya[t].real + ya[t].imag * ya[t].imag
+        power[t], weight[t] = square - 2 / ga[t], 0.25 * ga[t] / (square + 1 / ga[t])
+    for j in range(PAIRS):
+        found[j, 0], distances[j, 0] = math.inf, math.inf
+    # The modulation in the middle of the comb leaves the distance open by whole fringes, and its sense.
+    cosine = max(-0.95, min((power[middle] - a1 * a1 - bounce * bounce) / (2 * a1 * bounce), 0.95))
+    offset = fringe * math.acos(cosine) / (2 * math.pi)
+    for number in range(2 * int(_APART_PX / fringe) + 1):
+        apart = (number + 1) // 2 * fringe + (-offset if number % 2 else offset)
+        d, a2, chi2 = _distance(power, weight, comb, a1, bounce, sigma_bounce, apart)
+        place = PAIRS
+        while place > 0 and chi2 < distances[place - 1, 0]:
+            place -= 1
+        if place < PAIRS and chi2 < distances[0, 0] + _HOPELESS_CHI2:
+            for j in range(PAIRS - 1, place, -1):
+                for m in range(3):
+                    distances[j, m] = distances[j - 1, m]
+            distances[place, 0], distances[place, 1], distances[place, 2] = chi2, d, a2
+    for number in range(2 * PAIRS):
+        least, a2 = distances[number // 2, 0], distances[number // 2, 2]
+        if not least < min(distances[0, 0], found[0, 0]) + _HOPELESS_CHI2:
+            break
+        apart = -distances[number // 2, 1] if number % 2 else distances[number // 2, 1]
+        u1, u2, chi2 = _pair_at(ya, ga, comb, a1, a2, apart, low, high, left)
+        if not (low <= u1 < high and low <= u2 < high):
+            continue
+        place = PAIRS - 1
+        for j in range(PAIRS):
+            # Neighbours of a pair that is kept already lead to the same place.
+            if found[j, 0] < math.inf and abs(u1 - found[j, 1]) < 1 and abs(u2 - found[j, 2]) < 1:
+                place = j
+                break
+        if not chi2 < found[place, 0]:
+            continue
+        while place > 0 and chi2 < found[place - 1, 0]:
+            for m in range(4):
+                found[place, m] = found[place - 1, m]
+            place -= 1
+        found[place, 0], found[place, 1], found[place, 2], found[place, 3] = chi2, u1, u2, a2
+
+
+@compiled  # pragma: no cover
+def _known(thetas: Reals, count: int) -> bool:
+    """Whether the hypothesis ``thetas[count]`` is one of those before it."""
+    for h in range(count):
+        away = 0.0
+        for k in (0, 1, 4, 5):
+            away = max(away, abs(thetas[h, k] - thetas[count, k]))
+        if away < _SAME_PX:
+            return True
+    return False
+
+
+@compiled  # pragma: no cover
+def seed_block(
+    za: NDArray[np.complex64], zb: NDArray[np.complex64], sigma_a: Reals, sigma_b: Reals, gain_a: Reals, gain_b: Reals,
+    comb: Reals, low_a: float, high_a: float, low_b: float, high_b: float, fits: Floats, other: Reals, slopes: Reals,
+    fits_across: Floats, prior: Reals, start: int, seeds: Reals, lines: Reals, bounds: Reals,
+) -> None:  # fmt: skip
+    """Hypotheses of the pixels from ``start`` on, as many as ``bounds`` has rows.
+
+    ``seeds`` (n, most, 8) get u₁, u₂, a₁, a₂ along and across, path 1 direct; ``lines`` (n, most, 3) a place along, the
+    place across that the line gives to it, and the line's slope; ``bounds`` (n, most) what χ² will hardly fall below,
+    infinite where there is no more hypothesis.
+    """
+    count_a, count_b, kinds, kinds_across = za.shape[0], zb.shape[0], fits.shape[0], fits_across.shape[0]
+    ya, yb = np.empty(count_a, np.complex128), np.empty(count_b, np.complex128)
+    left, moduli = np.empty(max(count_a, count_b), np.complex128), np.empty((2, count_a))
+    ga, gb = np.empty(count_a), np.empty(count_b)
+    pairs, distances = np.empty((PAIRS, 4)), np.empty((PAIRS, 3))
+    kappa = math.exp(prior[4])
+    for n in range(bounds.shape[0]):
+        p = start + n
+        for t in range(count_a):
+            ya[t], ga[t] = (1 / gain_a[t]) * za[t, p], (gain_a[t] / sigma_a[p]) ** 2
+        for t in range(count_b):
+            yb[t], gb[t] = (1 / gain_b[t]) * zb[t, p], (gain_b[t] / sigma_b[p]) ** 2
+        tried = 0
+        for h in range(bounds.shape[1]):
+            bounds[n, h] = math.inf
+        for k in range(kinds):
+            for i in range(2):
+                place = other[2 * k + i, p]
+                if not (low_b - 1 <= place < high_b + 1):
+                    continue
+                theta = seeds[n, tried]
+                theta[0], theta[1] = fits[k, i, p], fits[k, 1 - i, p]
+                theta[2], theta[3] = fits[k, 2 + i, p], fits[k, 3 - i, p]
+                theta[4], theta[6] = place, kappa * theta[2]
+                theta[5], rest = _rest(yb, gb, comb, place, theta[6], low_b, high_b, left)
+                theta[7] = max(rest, 0.1 * kappa * theta[3])
+                lines[n, tried, 0], lines[n, tried, 1], lines[n, tried, 2] = theta[0], place, slopes[2 * k + i, p]
+                # Both axes together cannot fit better than this one alone.
+                bounds[n, tried] = fits[k, 7, p]
+                tried += 1
+        for k in range(kinds_across):
+            for i in range(2):
+                b1, b2 = fits_across[k, 2 + i, p], fits_across[k, 3 - i, p]
+                allowed = _NEAR_LINE_PX + _NEAR_LINE_SIGMAS * (prior[3] + fits_across[k, 4 + i, p])
+                if not (fits_across[k, 7, p] < fits_across[0, 7, p] + _HOPELESS_CHI2 and b1 > 0):
+                    continue
+                off = math.inf
+                for m in range(other.shape[0]):
+                    if math.isfinite(other[m, p]):
+                        off = min(off, abs(fits_across[k, i, p] - other[m, p]) - _APART_PX * abs(slopes[m, p]))
+                if not off < allowed:
+                    continue
+                _pairs(
+                    ya, ga, comb, b1 / kappa, b2 / kappa, prior[6], low_a, high_a, left, moduli, distances, pairs
+                )  # fmt: skip
+                for j in range(PAIRS):
+                    # The line through the place nearest to where it is known.
+                    nearest, apart = -1, math.inf
+                    for m in range(other.shape[0]):
+                        off = abs(fits[m // 2, m % 2, p] - pairs[j, 1])
+                        if math.isfinite(other[m, p]) and off < apart:
+                            nearest, apart = m, off
+                    if not pairs[j, 0] < pairs[0, 0] + _HOPELESS_CHI2 or nearest < 0:
+                        continue
+                    there, s = fits[nearest // 2, nearest % 2, p], slopes[nearest, p]
+                    place = other[nearest, p] + s * (pairs[j, 1] - there)
+                    if not abs(fits_across[k, i, p] - place) < allowed * math.sqrt(1 + s * s):
+                        continue
+                    theta = seeds[n, tried]
+                    theta[0], theta[1], theta[2], theta[3] = pairs[j, 1], pairs[j, 2], b1 / kappa, pairs[j, 3]
+                    theta[4], theta[5], theta[6], theta[7] = fits_across[k, i, p], fits_across[k, 1 - i, p], b1, b2
+                    if _known(seeds[n], tried):
+                        continue
+                    lines[n, tried, 0], lines[n, tried, 1], lines[n, tried, 2] = theta[0], place, s
+                    bounds[n, tried] = fits_across[k, 7, p]
+                    tried += 1
