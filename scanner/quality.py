@@ -148,6 +148,13 @@ def summarise(
     )
 
 
+def exposures_said(result: ScanResult) -> str:
+    """What each exposure was good for, in words; empty where there was one."""
+    return ", ".join(
+        f"{1e3 * e['exposure_s']:.4g} ms for {100 * e['used_share']:.1f} %" for e in result.summary.get("exposures", ())
+    )
+
+
 def passed(result: ScanResult) -> bool:
     """Whether a result passes all its gates."""
     return all(g["passed"] for g in result.summary["gates"])

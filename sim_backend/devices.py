@@ -263,7 +263,7 @@ class SimulatedCamera:
     def set_exposure(self, exposure_s: float) -> float:
         """Expose so long until the camera is configured again; returns it, s."""
         self._life.require("set_exposure", DeviceState.CONFIGURED)
-        self._expose_for(1e6 * exposure_s)
+        self._expose_for(round(1e6 * exposure_s, 3))
         return self.exposure_s
 
     def _expose_for(self, exposure_us: float) -> None:

@@ -130,7 +130,7 @@ class GenICamCamera:
             The camera does not take it; the message quotes its own limits.
         """
         self._life.require("set_exposure", DeviceState.CONFIGURED)
-        made_us: float = self._call("set_exposure", 1e6 * exposure_s)
+        made_us: float = self._call("set_exposure", round(1e6 * exposure_s, 3))
         self._exposure_us = made_us
         return made_us * 1e-6
 

@@ -6,7 +6,7 @@ exposure, by maximum likelihood, from the exposures in which the pixel never sat
 """
 
 from scanner.exposures.fusion import Fused, FusedNoise, Source, fuse
-from scanner.exposures.linearity import LightRatios, contrast_ratio
+from scanner.exposures.linearity import LightRatio, contrast_ratio
 from scanner.exposures.passes import NEAR_SATURATION, ExposurePass
 from scanner.exposures.series import ExposureSeries, agree, read_plan
 
@@ -16,7 +16,7 @@ __all__ = [
     "ExposureSeries",
     "Fused",
     "FusedNoise",
-    "LightRatios",
+    "LightRatio",
     "Source",
     "agree",
     "contrast_ratio",

@@ -12,8 +12,9 @@ all frames share, a black level or an error of an exposure, then changes mean an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from drivers import FrameFormat, NoiseModel, Pixels
 from scanner import kernels
-from scanner.exposures.linearity import LightRatios
+from scanner.exposures.linearity import LightRatio
 from scanner.exposures.passes import ExposurePass
 from scanner.exposures.series import ExposureSeries
 from scanner.methods import Method, RoundFrames
@@ -103,7 +104,7 @@ class Fused:
     figures
         For each exposure, JSON-ready: ``exposure_s``, ``relative``, the share of pixels that are measured with it
         (``used_share``) and that saturate in it (``saturated_share``), and ``measured_relative``, what its light says;
-        None where too little is shared with the longest.
+        None where it shares too few pixels with the next.
     """
 
     frames: RoundFrames
@@ -198,14 +199,8 @@ def fuse(
     fmt = kept[0].frame_format
     wide = FusedFormat(fmt.width, fmt.height, fmt.bits, fmt.saturated_dn / min(relative))
     collected = method.collect(plan, wide)
-    longest = int(np.argmax(relative))
     sampled = kept[0].sampled
-    mean = kept[longest].mean[sampled].ravel()
-    ratios = LightRatios(
-        longest,
-        np.stack([~p.bright[sampled].ravel() for p in kept]),
-        np.broadcast_to(np.asarray(noises[longest].variance(mean), np.float32), mean.shape),
-    )
+    ratios = _ratios(kept, relative, noises)
     for sequence in sorted(kept[0].added.intersection(*(p.added for p in kept))):
         frames = np.zeros((len(plan.sequences[sequence]), *fmt.shape), np.float32)
         samples = []
@@ -214,26 +209,26 @@ def fuse(
             _add_weighted(frames, raw, gain)
             samples.append(raw[:, *sampled].reshape(len(raw), -1).astype(np.float32))
             del raw
-        ratios.add(samples)
+        for (longer, shorter), ratio in ratios.items():
+            ratio.add(samples[longer], samples[shorter])
         frames[:, weights.dead] = wide.saturated_dn
         collected.add(sequence, cast(Pixels, frames))
-    measured = dict(zip(chosen, np.array(ratios.measured) * relative[longest], strict=True))
-    figures: list[dict[str, Any]] = []
-    for k, p in enumerate(passes):
-        used = weights.gain[chosen.index(k)] > 0 if k in chosen else np.zeros(1, bool)
-        told = measured.get(k, float("nan"))
-        figures.append(
-            {
-                "exposure_s": series.made_s[k],
-                "relative": series.relative[k],
-                "used_share": float(used.mean()),
-                "saturated_share": float(p.saturated.mean()) if p.added else None,
-                "measured_relative": float(told) if np.isfinite(told) else None,
-            }
-        )
-        if abs(told / series.relative[k] - 1) > _LINEAR:
-            warnings.append(_not_linear(series, k, chosen[longest], float(told)))
-    nearest = noises[int(np.argmin(np.abs(np.log(relative))))]
+    for (longer, shorter), ratio in ratios.items():
+        if abs(ratio.measured * relative[longer] / relative[shorter] - 1) > _LINEAR:
+            warnings.append(_not_linear(series, chosen[longer], chosen[shorter], ratio.measured))
+    reference = int(np.argmin(np.abs(np.log(relative))))
+    measured = dict(zip(chosen, _chained(reference, relative, ratios), strict=True))
+    figures = [
+        {
+            "exposure_s": series.made_s[k],
+            "relative": series.relative[k],
+            "used_share": float((weights.gain[chosen.index(k)] > 0).mean()) if k in chosen else 0.0,
+            "saturated_share": float(p.saturated.mean()) if p.added else None,
+            "measured_relative": measured.get(k),
+        }
+        for k, p in enumerate(passes)
+    ]
+    nearest = noises[reference]
     noise = FusedNoise(nearest.read_dn, nearest.dn_per_electron, pixels=weights.variance)
     return Fused(collected, noise, warnings, figures)
 
@@ -248,10 +243,41 @@ def _add_weighted(total: NDArray[np.float32], frames: Pixels, gain: NDArray[np.f
     kernels.over_rows(rows, gain.shape[0])
 
 
-def _not_linear(series: ExposureSeries, number: int, longest: int, told: float) -> str:
+def _ratios(
+    passes: Sequence[ExposurePass], relative: Sequence[float], noises: Sequence[NoiseModel]
+) -> dict[tuple[int, int], LightRatio]:
+    """For each exposure and the next shorter one, by their numbers, what compares their light."""
+    sampled = passes[0].sampled
+    found = {}
+    for longer, shorter in pairwise(np.argsort(relative)[::-1].tolist()):
+        good = ~(passes[longer].bright | passes[shorter].bright)[sampled].ravel()
+        mean = passes[longer].mean[sampled].ravel()
+        variance = np.broadcast_to(np.asarray(noises[longer].variance(mean), np.float32), mean.shape)
+        found[longer, shorter] = LightRatio(good, variance)
+    return found
+
+
+def _chained(
+    reference: int, relative: Sequence[float], ratios: Mapping[tuple[int, int], LightRatio]
+) -> list[float | None]:
+    """Light of every exposure in units of the bench's own, by the measured ratios; None where one is not known."""
+    found: list[float | None] = [None] * len(relative)
+    found[reference] = relative[reference]
+    pairs = list(ratios.items())
+    for (longer, shorter), ratio in pairs:
+        known = found[longer]
+        if known is not None and np.isfinite(ratio.measured):
+            found[shorter] = known * ratio.measured
+    for (longer, shorter), ratio in reversed(pairs):
+        known = found[shorter]
+        if known is not None and found[longer] is None and np.isfinite(ratio.measured):
+            found[longer] = known / ratio.measured
+    return found
+
+
+def _not_linear(series: ExposureSeries, longer: int, shorter: int, told: float) -> str:
     return (
-        f"{series.label(number)} gives {told / series.relative[longest]:.3f} of the light of "
-        f"{1e3 * series.made_s[longest]:.4g} ms, not {series.made_s[number] / series.made_s[longest]:.3f}: the camera "
-        "does not respond linearly (a gamma is set, or the light flickers), or its exposure is not what it says; "
-        "modulation and σ are off by as much"
+        f"{series.label(shorter)} gives {told:.3f} of the light of {1e3 * series.made_s[longer]:.4g} ms, not "
+        f"{series.made_s[shorter] / series.made_s[longer]:.3f}: the camera does not respond linearly (a gamma is set, "
+        "or the light flickers), or its exposure is not what it says; modulation and σ are off by as much"
     )

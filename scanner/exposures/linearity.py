@@ -5,8 +5,6 @@ The black level drops out: only differences between patterns are compared.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,50 +17,41 @@ _FEWEST = 200
 """Pixels that are enough to tell it."""
 
 
-class LightRatios:
-    """The light of every exposure over that of the longest, measured where both are good.
+class LightRatio:
+    """The light of one exposure over that of a longer one, measured where both are good.
 
     The slope of one's frames against the other's, frame by frame about their mean, over all pixels; the noise of the
     abscissa, which would flatten it, is known and taken off (errors-in-variables; Fuller, Measurement Error Models,
-    1987, §1.2).
+    1987, §1.2). Bright pixels count most, so that grey values cut off at 0 do not tell.
 
     Parameters
     ----------
-    longest
-        Number of the exposure that the others are compared with.
     good
-        (E, P) bool, pixels that each exposure measures.
+        (P,) bool, pixels that both exposures measure.
     variance
-        (P,) of a frame of the longest, DN².
+        (P,) of a frame of the longer, DN².
     """
 
-    def __init__(self, longest: int, good: NDArray[np.bool_], variance: NDArray[np.float32]) -> None:
-        self._longest = longest
+    def __init__(self, good: NDArray[np.bool_], variance: NDArray[np.float32]) -> None:
         self._good = good
         self._variance = variance
-        self._products = np.zeros(len(good))
-        self._squares = np.zeros(len(good))
-        self._pixels = np.zeros(len(good), int)
+        self._products = self._squares = 0.0
+        self._pixels = 0
 
-    def add(self, values: Sequence[NDArray[np.float32]]) -> None:
-        """Take over the (N, P) grey values of one sequence at every exposure."""
-        anchor = values[self._longest] - values[self._longest].mean(axis=0)
-        power = np.square(anchor).sum(axis=0)
-        noise = (len(anchor) - 1) * self._variance
-        strong = power > (1 + _STRONG**2) * noise
-        for k, other in enumerate(values):
-            both = self._good[k] & self._good[self._longest] & strong
-            self._pixels[k] = max(self._pixels[k], np.count_nonzero(both))
-            self._products[k] += float((anchor[:, both] * other[:, both]).sum())
-            self._squares[k] += float((power[both] - noise[both]).sum())
+    def add(self, longer: NDArray[np.float32], shorter: NDArray[np.float32]) -> None:
+        """Take over the (N, P) grey values of one sequence at both exposures."""
+        off = longer - longer.mean(axis=0)
+        power = np.square(off).sum(axis=0)
+        noise = (len(off) - 1) * self._variance
+        told = self._good & (power > (1 + _STRONG**2) * noise)
+        self._pixels = max(self._pixels, int(np.count_nonzero(told)))
+        self._products += float((off[:, told] * shorter[:, told]).sum())
+        self._squares += float((power[told] - noise[told]).sum())
 
     @property
-    def measured(self) -> list[float]:
-        """(E,) light over that of the longest exposure; NaN where too few pixels are good in both."""
-        return [
-            p / s if n >= _FEWEST else float("nan")
-            for p, s, n in zip(self._products, self._squares, self._pixels, strict=True)
-        ]
+    def measured(self) -> float:
+        """The ratio; NaN where too few pixels are good in both."""
+        return self._products / self._squares if self._pixels >= _FEWEST else float("nan")
 
 
 def contrast_ratio(
