@@ -230,13 +230,8 @@ class Acquisition:
         except BaseException:
             self._darken_if_possible()
             raise
-        else:
-            self.bench.darken()
-        finally:
-            self._leave_exposure()
-
-    def _leave_exposure(self) -> None:
-        """Set the bench's own exposure again, which on the way out of trouble may fail as well."""
+        self.bench.darken()
+        # Not on the way out of trouble, where it would wait for a lost camera once more; and what is measured counts.
         if self.exposures is not None and isinstance(self.bench, ExposureControl):
             with suppress(HardwareError):
                 self.bench.set_exposure(self.exposures.reference_s)
