@@ -17,8 +17,8 @@ from calibration.photometry import PhotometryError
 from calibration.settings import CalibrationSettings
 from calibration.work import StepFailedError, Work
 from drivers import OperatorError
-from scanner.acquisition import ExposureError
 from scanner.config import LoadedConfig, load_config
+from scanner.preflight import ExposureError
 from scanner.rig import Rig
 from scanner.terminal import Terminal
 

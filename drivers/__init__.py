@@ -1,8 +1,9 @@
 """What a device is, and the real ones. Knows nobody else."""
 
-from drivers.bench import Bench, BenchKind, LatencyBound, Presenter, SceneTruth, TruthTeller
+from drivers.bench import Bench, BenchKind, ExposureControl, LatencyBound, Presenter, SceneTruth, TruthTeller
 from drivers.clock import SystemClock
 from drivers.devices import (
+    AdjustableCamera,
     Camera,
     Clock,
     Device,
@@ -38,6 +39,7 @@ from drivers.stepped import SteppedBench
 from drivers.streamed import StreamedBench
 
 __all__ = [
+    "AdjustableCamera",
     "Bench",
     "BenchKind",
     "Camera",
@@ -49,6 +51,7 @@ __all__ = [
     "DeviceSettingError",
     "DeviceState",
     "DisplayLatency",
+    "ExposureControl",
     "FrameFormat",
     "FrameLossError",
     "FrameStamp",

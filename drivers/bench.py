@@ -79,6 +79,38 @@ class Bench(Protocol):
         ...
 
 
+@runtime_checkable
+class ExposureControl(Protocol):
+    """A bench whose camera's exposure can be changed between two sequences."""
+
+    @property
+    def exposure_s(self) -> float:
+        """The exposure that is set, s; on an open bench at first the one of its settings."""
+        ...
+
+    def check_exposure(self, exposure_s: float) -> None:
+        """Refuse an exposure (s) with which the bench could not answer for its frames; touches no device.
+
+        Raises
+        ------
+        DeviceSettingError
+            Such as one that cuts a refresh of the projector.
+        """
+        ...
+
+    def set_exposure(self, exposure_s: float) -> float:
+        """Have the sequences prepared from now on exposed so long; returns the exposure that was made of it, s.
+
+        Raises
+        ------
+        DeviceSettingError
+            The bench or its camera refuses it.
+        HardwareError
+            A device failed; where the error is ``repeatable``, it may be asked for again.
+        """
+        ...
+
+
 class BenchKind(Protocol):
     """What an entry point of the group ``scanner.benches`` loads.
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.devices import (
+    AdjustableCamera,
     Camera,
     Clock,
     Device,
@@ -34,6 +35,7 @@ from drivers.errors import (
     SequenceFaultError,
 )
 from drivers.latency import DisplayLatency, KeepStep, measure_latency
+from drivers.refreshes import whole_refreshes
 
 _RETRY_S = 0.5
 
@@ -57,6 +59,8 @@ class DeviceBench:
         From the end of an exposure until its frame must have come, s.
     reconnect_s
         How long a device that was lost is waited for, s.
+    whole_refreshes
+        Whether another exposure than ``exposure_s`` must last a whole number of the projector's refreshes.
 
     Notes
     -----
@@ -75,13 +79,17 @@ class DeviceBench:
     rig: Mapping[str, Any] | None = None
     trigger: Trigger | None = None
     reconnect_s: float = 0.0
+    whole_refreshes: bool = False
     latency: DisplayLatency | None = field(default=None, init=False)
     _format: FrameFormat | None = field(default=None, init=False)
     _patterns: int = field(default=0, init=False)
     _disturbed: bool = field(default=False, init=False)
+    _own_exposure_s: float = field(default=0.0, init=False)
+    _wanted_exposure_s: float | None = field(default=None, init=False)
     _stack: ExitStack = field(default_factory=ExitStack, init=False)
 
     def __enter__(self) -> Self:
+        self._own_exposure_s = self.exposure_s
         with ExitStack() as stack:
             for device in self._devices:
                 stack.callback(device.close)
@@ -148,6 +156,60 @@ class DeviceBench:
             progress=progress,
             keep=keep,
         )
+
+    def check_exposure(self, exposure_s: float) -> None:
+        """Refuse an exposure that is not this bench's; see `drivers.bench.ExposureControl`."""
+        if not isinstance(self.camera, AdjustableCamera):
+            raise DeviceSettingError(
+                f"{self.name}: the exposure of {self.camera.name} cannot be changed in a scan",
+                "Scan with one exposure: leave scan.exposures out.",
+            )
+        if self._own_exposure_s <= 0:
+            raise DeviceSettingError(
+                f"{self.name}: the exposure of {self.camera.name} is not known, so no other can be told from it",
+                "Write bench.camera.exposure_us.",
+            )
+        if not self.whole_refreshes or exposure_s == self._own_exposure_s:
+            return
+        # A window that holds a picture for several refreshes still refreshes it.
+        refresh_s = getattr(self.projector, "refresh_s", self.projector.period_s)
+        if whole_refreshes(exposure_s, refresh_s) is None:
+            own = self._own_exposure_s / refresh_s
+            raise DeviceSettingError(
+                f"{self.name}: an exposure of {1e6 * exposure_s:.0f} µs is {exposure_s / refresh_s:.3f} refreshes of "
+                f"the projector ({1e3 * refresh_s:.3f} ms), not a whole number",
+                f"bench.camera.exposure_us is {own:.4g} refreshes: choose scan.exposures whose product with that is "
+                "whole, and make exposure_us longer where there is none; or set bench.whole_refreshes to false for a "
+                "projector whose light is steady within a refresh.",
+            )
+
+    def set_exposure(self, exposure_s: float) -> float:
+        """Expose so long from the next sequence on; see `drivers.bench.ExposureControl`."""
+        self.check_exposure(exposure_s)
+        self._recover()
+        former_s, self._wanted_exposure_s = self._wanted_exposure_s, exposure_s
+        try:
+            self.camera.stop()
+            try:
+                self._apply_exposure()
+            except DeviceSettingError:
+                # Refused: the camera goes on as it was.
+                self._wanted_exposure_s = former_s
+                raise
+            finally:
+                if self.camera.state is DeviceState.CONFIGURED:
+                    self.camera.arm()
+                    self.camera.start()
+        except BaseException:
+            self._disturbed = True
+            raise
+        return self.exposure_s
+
+    def _apply_exposure(self) -> None:
+        """Set what `set_exposure` has asked for, also on a camera that was lost and has come back."""
+        if self._wanted_exposure_s is not None:
+            assert isinstance(self.camera, AdjustableCamera)
+            self.exposure_s = self.camera.set_exposure(self._wanted_exposure_s)
 
     def prepare(self, patterns: Sequence[NDArray[np.uint8]]) -> None:
         """Bring back what was lost, forget what a broken sequence has left, and load the patterns."""
@@ -254,7 +316,8 @@ class DeviceBench:
         elif device is self.camera:
             if fresh:
                 self._configure_camera()
-            else:
+                self._apply_exposure()
+            elif self.camera.state is not DeviceState.CONFIGURED:
                 self.camera.stop()
             self.camera.arm()
             self.camera.start()

@@ -266,6 +266,25 @@ class Camera(Device, Protocol):
 
 
 @runtime_checkable
+class AdjustableCamera(Camera, Protocol):
+    """A camera whose exposure can be changed between two sequences."""
+
+    def set_exposure(self, exposure_s: float) -> float:
+        """Expose so long from now on; allowed while CONFIGURED, and until the next ``configure``.
+
+        Returns
+        -------
+        The exposure that the camera has made of it, s.
+
+        Raises
+        ------
+        DeviceSettingError
+            The camera does not take it; the message quotes its own limits.
+        """
+        ...
+
+
+@runtime_checkable
 class Projector(Device, Protocol):
     """Something that shows 8-bit grey pictures. ``open → configure → load → show* → darken → close``."""
 

@@ -16,6 +16,7 @@ from drivers.devices import Clock, Projector, Trigger
 from drivers.errors import DeviceSettingError
 from drivers.genicam.settings import GenICamSettings
 from drivers.lightcrafter.settings import LightCrafter4500Settings, LightCrafter6500Settings, LightCrafter9000Settings
+from drivers.refreshes import whole_refreshes
 from drivers.stepped import SteppedBench
 from drivers.streamed import StreamedBench
 from drivers.trigger_box.settings import PrawnBlasterSettings, SltSettings
@@ -23,9 +24,6 @@ from drivers.window.settings import WindowSettings
 
 if TYPE_CHECKING:
     from drivers.examination import Finding
-
-_WHOLE = 0.01
-"""How far an exposure may be from a whole number of refreshes, as a share of one: cameras round to their lines."""
 
 
 class _Section(BaseModel):
@@ -157,6 +155,7 @@ def make_bench(settings: HardwareSettings, clock: Clock) -> DeviceBench:
         "settle_s": settings.settle_s,
         "exposure_s": (settings.camera.exposure_us or 0.0) * 1e-6,
         "reconnect_s": settings.reconnect_s,
+        "whole_refreshes": settings.whole_refreshes,
     }
     return SteppedBench(**parts) if settings.synchronisation == "step" else StreamedBench(**parts)
 
@@ -204,8 +203,7 @@ def check_exposure_period(exposure_us: float, period_s: float) -> None:
         It is not; the remedy names the nearest that are.
     """
     refreshes = exposure_us * 1e-6 / period_s
-    whole = max(round(refreshes), 1)
-    if abs(refreshes - whole) > _WHOLE:
+    if whole_refreshes(exposure_us * 1e-6, period_s) is None:
         below, above = max(int(refreshes), 1), int(refreshes) + 1
         nearest = " or ".join(f"{n * period_s * 1e6:.0f}" for n in sorted({below, above}))
         raise DeviceSettingError(

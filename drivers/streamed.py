@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from drivers.device_bench import DeviceBench
 from drivers.devices import FrameStamp, Pixels, SequencePlayer
-from drivers.errors import FrameLossError, SequenceFaultError
+from drivers.errors import DeviceSettingError, FrameLossError, SequenceFaultError
 
 _LONG_LATENCY_S = 0.3
 """Longer than displays are late; taken where nobody has measured."""
@@ -62,6 +62,22 @@ class StreamedBench(DeviceBench):
         if self._next == self._patterns:
             self._check_played()
         return stamp
+
+    def check_exposure(self, exposure_s: float) -> None:
+        """Refuse also what is longer than the bench's own exposure, which is made for the time that a pattern is on."""
+        super().check_exposure(exposure_s)
+        if exposure_s > self._own_exposure_s:
+            raise DeviceSettingError(
+                f"{self.name}: an exposure of {1e6 * exposure_s:.0f} µs is longer than bench.camera.exposure_us, and "
+                "streamed patterns follow one another at a fixed pace",
+                "Make bench.camera.exposure_us the longest and all scan.exposures 1 or less, or set synchronisation: "
+                "step.",
+            )
+
+    def set_exposure(self, exposure_s: float) -> float:
+        """Expose so long from the next sequence on; the camera may count its frames anew."""
+        self._last_id = None
+        return super().set_exposure(exposure_s)
 
     @property
     def _settled_after_s(self) -> float:

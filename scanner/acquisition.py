@@ -8,6 +8,8 @@ While one sequence is photographed, a second thread checks, commits and demodula
 fails its check, or in which a device failed, is taken again, at most as often as the scan allows; the bench brings a
 device back that was lost. When all sequences of a round are there, they are compared: one that is at odds with the
 others is revoked and taken again as well. On every way out the projector is dark.
+
+With several exposures a round is several such passes, one after the other, whose frames are then fused.
 """
 
 from __future__ import annotations
@@ -19,17 +21,18 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Protocol
+from typing import Any, Protocol, cast
 
-import cv2
 import numpy as np
 
-from drivers import Bench, HardwareError, OperatorError, Pixels
+from drivers import Bench, ExposureControl, HardwareError, NoiseModel, OperatorError, Pixels
 from scanner.config import ScanSection
 from scanner.decoding import Decoder
+from scanner.exposures import ExposurePass, ExposureSeries, agree, fuse
 from scanner.integrity import SequenceHistory, check_sequence
 from scanner.methods import Method, RoundFrames
 from scanner.patterns import Plan
+from scanner.preflight import check_exposure, check_exposures
 from scanner.result import Maps
 from scanner.take import TakeWriter
 
@@ -62,10 +65,6 @@ TRANSITIONS: Mapping[ScanState, frozenset[ScanState]] = {
 
 class AcquisitionError(HardwareError):
     """The bench does not deliver frames that show the patterns."""
-
-
-class ExposureError(OperatorError):
-    """The picture is too bright or too dark to measure with."""
 
 
 @dataclass(frozen=True)
@@ -145,6 +144,8 @@ class Acquisition:
         Is told how it goes.
     response
         Light of the projector's grey levels that the patterns are corrected for, as `scanner.patterns.Plan`.
+    exposures
+        What the bench has agreed to of ``scan.exposures``; None for a single one.
     """
 
     bench: Bench
@@ -154,13 +155,16 @@ class Acquisition:
     take: TakeWriter
     listener: Listener = field(default_factory=Silence)
     response: tuple[float, ...] | None = None
+    exposures: ExposureSeries | None = None
     state: ScanState = field(default=ScanState.IDLE, init=False)
     timings_s: dict[str, float] = field(default_factory=dict, init=False)
     frames: dict[int, int] = field(default_factory=dict, init=False)
     repeats: int = field(default=0, init=False)
     notes: list[str] = field(default_factory=list, init=False)
+    exposure_figures: list[dict[str, Any]] = field(default_factory=list, init=False)
     _done: int = field(default=0, init=False)
-    _history: SequenceHistory = field(default_factory=SequenceHistory, init=False)
+    _histories: list[SequenceHistory] = field(default_factory=list, init=False)
+    _exposure: int = field(default=0, init=False)
 
     def run(self) -> Maps:
         """Both rounds; returns the fused maps.
@@ -179,30 +183,22 @@ class Acquisition:
                 planned = self.method.first_round(self.scan, self.bench.projector_size)
                 first_plan = replace(planned, response=self.response)
                 self._enter(ScanState.PREFLIGHT, "exposure check")
+                if self.exposures is None:
+                    self.exposures = agree(self.bench, self.scan.exposures)
+                self._histories = [SequenceHistory() for _ in range(self._passes)]
                 levels = self._preflight(first_plan)
-                self._history.begin_round(
-                    first_plan.size, levels=levels, saturated_dn=self.bench.frame_format.saturated_dn
-                )
-                first = self._capture(1, first_plan, first_plan.frame_count)
+                first, noise = self._round(1, first_plan, first_plan.frame_count, levels)
                 self._enter(ScanState.DECODING, "decoding round 1")
                 with self._timed("decode round 1"):
-                    second_plan = self.decoder.first(first)
+                    second_plan = self.decoder.first(first, noise)
                 if self.decoder.decision:
                     self.listener.note(self.decoder.decision)
                     self.take.note(self.decoder.decision)
                 if second_plan is not None:
-                    found = self.decoder.maps
-                    self._history.begin_round(
-                        second_plan.size,
-                        levels=self._levels(second_plan),
-                        saturated_dn=self.bench.frame_format.saturated_dn,
-                        coordinates=(found.x_p, found.y_p),
-                        lit=second_plan.mask,
-                    )
-                    second = self._capture(2, second_plan, first_plan.frame_count + second_plan.frame_count)
+                    second, noise = self._round(2, second_plan, first_plan.frame_count + second_plan.frame_count, None)
                     self._enter(ScanState.DECODING, "decoding round 2")
                     with self._timed("decode round 2"):
-                        self.decoder.second(second)
+                        self.decoder.second(second, noise)
             self._enter(ScanState.COMPLETED, "done")
             return self.decoder.maps
         except KeyboardInterrupt:
@@ -217,6 +213,16 @@ class Acquisition:
         """Rounds at most."""
         return self.scan.rounds_at_most(self.method.rounds)
 
+    @property
+    def _passes(self) -> int:
+        """Exposures of a round."""
+        return 1 if self.exposures is None else len(self.exposures)
+
+    @property
+    def _history(self) -> SequenceHistory:
+        """Of the present exposure: at another, a picture looks different."""
+        return self._histories[self._exposure]
+
     @contextmanager
     def _dark_afterwards(self) -> Iterator[None]:
         try:
@@ -225,6 +231,10 @@ class Acquisition:
             self._darken_if_possible()
             raise
         self.bench.darken()
+        # Not on the way out of trouble, where it would wait for a lost camera once more; and what is measured counts.
+        if self.exposures is not None and isinstance(self.bench, ExposureControl):
+            with suppress(HardwareError):
+                self.bench.set_exposure(self.exposures.reference_s)
 
     def _darken_if_possible(self) -> None:
         """Switch the light off on the way out of trouble, which a projector that fails as well must not hide."""
@@ -259,11 +269,104 @@ class Acquisition:
         self.notes.append(text)
         self.listener.note(text)
 
-    def _preflight(self, plan: Plan) -> tuple[Pixels, Pixels]:
-        """Look at the brightest and the darkest picture before anything is measured; returns their frames."""
-        bright, dark = self._levels(plan)
-        check_exposure(bright, dark, self.bench.frame_format.saturated_dn, self.scan.max_saturated_share)
-        return bright, dark
+    def _preflight(self, plan: Plan) -> list[tuple[Pixels, Pixels]]:
+        """Look at the brightest and the darkest picture before anything is measured; returns their frames.
+
+        With several exposures the shortest must not be too bright, and the longest not too dark.
+        """
+        levels = []
+        for exposure in range(self._passes):
+            self._expose_for(exposure)
+            levels.append(self._levels(plan))
+        saturated_dn, share = self.bench.frame_format.saturated_dn, self.scan.max_saturated_share
+        if self.exposures is None:
+            check_exposure(*levels[0], saturated_dn, share)
+        else:
+            check_exposures(levels, self.exposures, saturated_dn, share)
+        return levels
+
+    def _expose_for(self, exposure: int) -> None:
+        """Have the sequences from now on taken at this exposure of the series."""
+        self._exposure = exposure
+        if self.exposures is None:
+            return
+        assert isinstance(self.bench, ExposureControl)
+        for attempt in range(1, self.scan.attempts + 1):
+            try:
+                self.bench.set_exposure(self.exposures.made_s[exposure])
+                return
+            except HardwareError as error:
+                if not error.repeatable or attempt == self.scan.attempts:
+                    raise
+                self._note(f"{self.exposures.label(exposure)}: {error.message}; it was set again")
+
+    def _round(
+        self, number: int, plan: Plan, planned: int, levels: list[tuple[Pixels, Pixels]] | None
+    ) -> tuple[RoundFrames, NoiseModel | None]:
+        """Take a round at all exposures; returns what the method collected, and the noise where it was fused.
+
+        Parameters
+        ----------
+        number, plan
+            Of the round.
+        planned
+            Frames of all rounds so far, at one exposure.
+        levels
+            Frames of the brightest and the darkest picture at each exposure; None takes them now.
+        """
+        series = self.exposures
+        passes: list[RoundFrames] = []
+        for exposure in range(self._passes):
+            self._expose_for(exposure)
+            found = self.decoder.maps if number > 1 else None
+            self._history.begin_round(
+                plan.size,
+                levels=self._levels(plan) if levels is None else levels[exposure],
+                saturated_dn=self.bench.frame_format.saturated_dn,
+                coordinates=(None, None) if found is None else (found.x_p, found.y_p),
+                lit=plan.mask,
+            )
+            if not passes:
+                self.take.begin_round(number, plan.to_json() if series is None else series.recorded(plan))
+                self._enter(ScanState.CAPTURING, f"round {number} of {self._rounds}")
+            passes.append(self._capture(number, plan, planned * self._passes))
+        self.frames[number] = plan.frame_count * self._passes
+        if series is None:
+            return passes[0], None
+        with self._timed(f"fuse round {number}"):
+            fused = fuse(
+                self.method,
+                plan,
+                series,
+                cast("list[ExposurePass]", passes),
+                lambda exposure, sequence: self._recorded(number, exposure * len(plan.sequences) + sequence),
+                self.decoder.noise_of,
+            )
+        for warning in fused.warnings:
+            self._note(f"round {number}: {warning}")
+        self.exposure_figures = self.exposure_figures or fused.figures
+        return fused.frames, fused.noise
+
+    def _recorded(self, number: int, sequence: int) -> Pixels:
+        """Frames of a sequence that was committed, as the recording numbers it."""
+        frames = self.take.committed_frames(number, sequence)
+        assert frames is not None
+        return frames
+
+    def _in_take(self, plan: Plan, sequence: int) -> int:
+        """Number of a sequence of the plan in the recording, where every exposure has its own."""
+        return self._exposure * len(plan.sequences) + sequence
+
+    def _collection(self, plan: Plan) -> RoundFrames:
+        """An empty collection for the frames of a pass."""
+        if self.exposures is None:
+            return self.method.collect(plan, self.bench.frame_format)
+        return ExposurePass(plan, self.bench.frame_format, self.method)
+
+    def _label(self, plan: Plan, sequence: int) -> str:
+        """Short name of a sequence, with its exposure where there are several."""
+        label = plan.sequences[sequence].label
+        return label if self.exposures is None else f"{label}, {self.exposures.label(self._exposure)}"
 
     def _levels(self, plan: Plan) -> tuple[Pixels, Pixels]:
         """Frames under the brightest and the darkest level of the fringes, where the plan lights at all."""
@@ -288,10 +391,8 @@ class Acquisition:
         return bright, dark
 
     def _capture(self, number: int, plan: Plan, total: int) -> RoundFrames:
-        """Photograph all sequences of a round; returns what the method collected of them."""
-        self.take.begin_round(number, plan.to_json())
-        collected = self.method.collect(plan, self.bench.frame_format)
-        self._enter(ScanState.CAPTURING, f"round {number} of {self._rounds}")
+        """Photograph all sequences of a round at the present exposure; returns what was collected of them."""
+        collected = self._collection(plan)
         fmt = self.bench.frame_format
         longest = max(len(s) for s in plan.sequences)
         # Two buffers take turns: one is being filled while the other is checked and demodulated.
@@ -331,7 +432,6 @@ class Acquisition:
                 raise
         self.bench.darken()
         self._note_counters(number)
-        self.frames[number] = plan.frame_count
         return collected
 
     def _note_counters(self, number: int) -> None:
@@ -344,19 +444,18 @@ class Acquisition:
     def _expose_sequence(
         self, number: int, plan: Plan, sequence: int, attempt: int, frames: Pixels, total: int
     ) -> None:
-        fringes = plan.sequences[sequence]
         self.bench.prepare(plan.render(sequence))
         for index in range(len(frames)):
             stamp = self.bench.expose(index, frames[index])
-            self.take.write_frame(number, sequence, attempt, index, frames[index], stamp)
+            self.take.write_frame(number, self._in_take(plan, sequence), attempt, index, frames[index], stamp)
             self._done += 1
             self.listener.frame(
                 Progress(
                     round=number,
                     rounds=self._rounds,
-                    sequence=sequence + 1,
-                    sequences=len(plan.sequences),
-                    label=fringes.label,
+                    sequence=self._in_take(plan, sequence) + 1,
+                    sequences=len(plan.sequences) * self._passes,
+                    label=self._label(plan, sequence),
                     frame=index + 1,
                     frames=len(frames),
                     done=self._done,
@@ -369,6 +468,7 @@ class Acquisition:
         self, number: int, plan: Plan, sequence: int, attempt: int, frames: Pixels, collected: RoundFrames
     ) -> Callable[[], list[str]]:
         """Check, record and demodulate; returns what is wrong with the sequence."""
+        recorded = self._in_take(plan, sequence)
 
         def job() -> list[str]:
             found = check_sequence(
@@ -376,9 +476,9 @@ class Acquisition:
             )
             if not found.good:
                 reasons = [f.message for f in found.findings]
-                self.take.abort_sequence(number, sequence, attempt, "; ".join(reasons))
+                self.take.abort_sequence(number, recorded, attempt, "; ".join(reasons))
                 return reasons
-            self.take.commit_sequence(number, sequence, attempt)
+            self.take.commit_sequence(number, recorded, attempt)
             collected.add(sequence, frames)
             return []
 
@@ -396,10 +496,9 @@ class Acquisition:
     ) -> list[tuple[int, int]]:
         """Return a sequence that failed its check again, with the next attempt, where there is one."""
         if attempt >= self.scan.attempts:
-            label = plan.sequences[sequence].label
             raise AcquisitionError(
-                f"round {number}, sequence {sequence + 1} ({label}) failed its check on {attempt} attempts: "
-                + "; ".join(reasons),
+                f"round {number}, sequence {sequence + 1} ({self._label(plan, sequence)}) failed its check on "
+                f"{attempt} attempts: " + "; ".join(reasons),
                 "Raise the bench's settle time (display latency), and check that nothing moves and no light flickers.",
             )
         return self._again(number, plan, sequence, attempt, reasons[0])
@@ -411,15 +510,15 @@ class Acquisition:
             places = [(s.axis, s.frequency) for s in plan.sequences]
             sequence = places.index((found.axis, found.frequency))
             attempt = attempts[sequence]
-            self.take.abort_sequence(number, sequence, attempt, found.message)
+            self.take.abort_sequence(number, self._in_take(plan, sequence), attempt, found.message)
             again += self._refused(number, plan, sequence, attempt, [found.message])
         return again
 
     def _collect_again(self, number: int, plan: Plan) -> RoundFrames:
         """Collect what still counts of a round from the recording: no trace is left of what was revoked."""
-        collected = self.method.collect(plan, self.bench.frame_format)
+        collected = self._collection(plan)
         for sequence in range(len(plan.sequences)):
-            frames = self.take.committed_frames(number, sequence)
+            frames = self.take.committed_frames(number, self._in_take(plan, sequence))
             if frames is not None:
                 collected.add(sequence, frames)
         return collected
@@ -429,50 +528,15 @@ class Acquisition:
     ) -> list[tuple[int, int]]:
         """Record that a device failed within a sequence; returns it again, with the next attempt, where that helps."""
         self._darken_if_possible()
-        self.take.abort_sequence(number, sequence, attempt, error.message)
+        self.take.abort_sequence(number, self._in_take(plan, sequence), attempt, error.message)
         if not error.repeatable or attempt >= self.scan.attempts:
             raise error
         return self._again(number, plan, sequence, attempt, error.message)
 
     def _again(self, number: int, plan: Plan, sequence: int, attempt: int, reason: str) -> list[tuple[int, int]]:
-        fringes = plan.sequences[sequence]
-        self.repeats += len(fringes)
-        self._enter(ScanState.REPEATING, f"{fringes.label}, attempt {attempt + 1}")
-        self._note(f"round {number}, {fringes.label}: {reason}; the sequence was taken again")
+        label = self._label(plan, sequence)
+        self.repeats += len(plan.sequences[sequence])
+        self._enter(ScanState.REPEATING, f"{label}, attempt {attempt + 1}")
+        self._note(f"round {number}, {label}: {reason}; the sequence was taken again")
         self._enter(ScanState.CAPTURING, f"round {number} of {self._rounds}")
         return [(sequence, attempt + 1)]
-
-
-def check_exposure(bright: Pixels, dark: Pixels, saturated_dn: int, max_saturated_share: float) -> None:
-    """Refuse pictures that cannot be measured with.
-
-    Parameters
-    ----------
-    bright, dark
-        (H, W) frames of the brightest and the darkest level of the fringes.
-    saturated_dn
-        Grey value from which a pixel is saturated.
-    max_saturated_share
-        Share of the pixels that may be.
-
-    Raises
-    ------
-    ExposureError
-        Too many saturated pixels, or hardly any that the projector makes brighter.
-    """
-    share = float((bright >= saturated_dn).mean())
-    if share > max_saturated_share:
-        raise ExposureError(
-            f"exposure check: {100 * share:.1f} % of the pixels are saturated under full light, "
-            f"at most {100 * max_saturated_share:g} % may be",
-            "Shorten bench.camera.exposure_us, close the aperture, or allow more with scan.max_saturated_share.",
-        )
-    # Averaged over 8 × 8 pixels, so that noise does not pass for light.
-    contrast = cv2.blur(bright.astype(np.float32) - dark, (8, 8))
-    lit = float((contrast > max(0.02 * saturated_dn, 4)).mean())
-    if lit < 0.001:
-        raise ExposureError(
-            f"exposure check: the projector makes {100 * lit:.2f} % of the pixels brighter "
-            f"(brightest grey value {int(bright.max())} of {saturated_dn})",
-            "Take the lens caps off, switch the projector on, point both at the object, or lengthen the exposure.",
-        )

@@ -42,9 +42,17 @@ class Decoder:
     _first: FirstRound | None = field(default=None, init=False)
     _maps: Maps | None = field(default=None, init=False)
 
-    def first(self, frames: RoundFrames) -> Plan | None:
-        """Decode round one; returns the plan of round two, or None where there is nothing more to do."""
-        self.used_noise = self._noise_of(frames)
+    def first(self, frames: RoundFrames, noise: NoiseModel | None = None) -> Plan | None:
+        """Decode round one; returns the plan of round two, or None where there is nothing more to do.
+
+        Parameters
+        ----------
+        frames
+            Of the round.
+        noise
+            Of these frames where it is known, as of fused ones; None asks the frames.
+        """
+        self.used_noise = self.noise_of(frames) if noise is None else noise
         self._setup = Setup(self.scan, self.used_noise, self.rig)
         self._first = self.method.decode(frames, self._setup)
         self._maps = self._first.maps
@@ -52,14 +60,23 @@ class Decoder:
         self.decision = self._first.decision
         return self.method.second_round(self._first, self._setup)
 
-    def second(self, frames: RoundFrames) -> None:
-        """Join round two; with sequences missing, only what round one could tell alone is kept."""
+    def second(self, frames: RoundFrames, noise: NoiseModel | None = None) -> None:
+        """Join round two; with sequences missing, only what round one could tell alone is kept.
+
+        Parameters
+        ----------
+        frames
+            Of the round.
+        noise
+            Of these frames where it is another than in round one, as of fused ones.
+        """
         if self._first is None or self._setup is None:
             raise AssertionError("round two is decoded after round one")
         if len(frames.added) < len(frames.plan.sequences):
             self.give_up_second(frames.plan)
         else:
-            self._maps = self.method.fuse(self._first, frames, self._setup)
+            setup = self._setup if noise is None else replace(self._setup, noise=noise)
+            self._maps = self.method.fuse(self._first, frames, setup)
 
     def give_up_second(self, plan: Plan) -> None:
         """Say of the pixels that only round two could have told that the recording ended before it."""
@@ -78,23 +95,28 @@ class Decoder:
             raise AssertionError("nothing was decoded yet")
         return self._maps
 
-    def _noise_of(self, frames: RoundFrames) -> NoiseModel:
+    def noise_of(self, frames: RoundFrames) -> NoiseModel:
         """What the frames show goes before what the camera promises: it holds vibration and flicker too."""
         observed = frames.estimate_noise()
         if observed is None:
             if self.noise is None:
-                self.warnings.append(
+                self._warn(
                     f"neither camera nor frames tell the noise: {_ASSUMED_NOISE.read_dn:g} DN is assumed, and σ with it"
                 )
             return self.noise or _ASSUMED_NOISE
         if self.noise is not None:
             ratio = _middle_sigma(observed) / _middle_sigma(self.noise)
             if ratio > 1.3:
-                self.warnings.append(
+                self._warn(
                     f"the frames are {ratio:.1f} × as noisy as the camera's model says: vibration, flicker, or a "
                     "projector response that is not linear"
                 )
         return observed
+
+    def _warn(self, text: str) -> None:
+        """Say something once, however many exposures show it."""
+        if text not in self.warnings:
+            self.warnings.append(text)
 
 
 def _middle_sigma(noise: NoiseModel) -> float:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any, cast
 
+from drivers import NoiseModel, Pixels
 from scanner.config import GatesSection, ScanSection
 from scanner.decoding import Decoder
+from scanner.exposures import ExposurePass, fuse, read_plan
 from scanner.images import ImagesError, RecordedFrames
 from scanner.integrity import check_sequence
 from scanner.methods import METHODS, Method, RoundFrames
-from scanner.patterns import Plan
 from scanner.quality import summarise
 from scanner.response import corrected_for
 from scanner.result import ScanResult
@@ -45,18 +47,18 @@ def process_take(
         warnings.append(f"the recording is {take.status}" + (f": {take.reason}" if take.reason else ""))
     if 1 not in take.rounds:
         raise TakeError(f"{take.path}: round one was not begun", "There is nothing to process; scan again.")
-    first = _collect(take, 1, method, warnings, report)
+    first, noise, exposures = _collect(take, 1, method, decoder, warnings, report)
     timings = {"read and demodulate round 1": time.perf_counter() - began}
     began = time.perf_counter()
     report("decoding round 1")
-    planned = decoder.first(first)
+    planned = decoder.first(first, noise)
     timings["decode round 1"] = time.perf_counter() - began
     frames = {"round 1": sum(len(s.frames) for s in take.sequences(1).values())}
     if 2 in take.rounds and scan.rounds != 1:
         began = time.perf_counter()
-        second = _collect(take, 2, method, warnings, report)
+        second, noise, _ = _collect(take, 2, method, decoder, warnings, report)
         report("decoding round 2")
-        decoder.second(second)
+        decoder.second(second, noise)
         timings["decode round 2"] = time.perf_counter() - began
         frames["round 2"] = sum(len(s.frames) for s in take.sequences(2).values())
     elif planned is not None:
@@ -71,6 +73,7 @@ def process_take(
         frames=frames,
         timings_s=timings,
         bench=f"{take.manifest['bench'].get('name', 'unknown bench')}, take {take.manifest['uid']}",
+        exposures=exposures,
         projector=corrected_for(take.rounds[1].get("response"), (take.manifest.get("rig") or {}).get("metadata", {})),
         rounds=decoder.decision,
         warnings=[*warnings, *decoder.warnings],
@@ -127,16 +130,34 @@ def process_images(
     )
 
 
-def _collect(take: Take, number: int, method: Method, warnings: list[str], report: Report) -> RoundFrames:
-    plan = Plan.from_json(take.rounds[number])
-    frames = method.collect(plan, take.frame_format)
-    there = take.sequences(number)
-    for sequence in there:
-        report(f"round {number}, sequence {sequence + 1} of {len(plan.sequences)}: {plan.sequences[sequence].label}")
+def _collect(
+    take: Take, number: int, method: Method, decoder: Decoder, warnings: list[str], report: Report
+) -> tuple[RoundFrames, NoiseModel | None, list[dict[str, Any]]]:
+    """Frames of a round, the exposures fused where there are several; then their noise and figures as well."""
+    plan, series = read_plan(take.rounds[number])
+    count = len(plan.sequences)
+    passes: list[RoundFrames] = (
+        [method.collect(plan, take.frame_format)]
+        if series is None
+        else [ExposurePass(plan, take.frame_format, method) for _ in series.made_s]
+    )
+    for recorded in take.sequences(number):
+        exposure, sequence = divmod(recorded, count)
+        which = plan.sequences[sequence].label + ("" if series is None else f", {series.label(exposure)}")
+        report(f"round {number}, sequence {recorded + 1} of {count * len(passes)}: {which}")
         try:
-            pixels = take.frames(number, sequence)
+            pixels = take.frames(number, recorded)
         except TakeError as error:
             warnings.append(f"left out: {error.message}")
             continue
-        frames.add(sequence, pixels)
-    return frames
+        passes[exposure].add(sequence, pixels)
+    if series is None:
+        return passes[0], None, []
+    report(f"fusing the exposures of round {number}")
+
+    def read(exposure: int, sequence: int) -> Pixels:
+        return take.frames(number, exposure * count + sequence, verify=False)
+
+    fused = fuse(method, plan, series, cast("list[ExposurePass]", passes), read, decoder.noise_of)
+    warnings += fused.warnings
+    return fused.frames, fused.noise, fused.figures

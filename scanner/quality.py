@@ -30,6 +30,7 @@ def summarise(
     bench: str,
     projector: str = "",
     rounds: str = "",
+    exposures: Sequence[Mapping[str, Any]] = (),
     warnings: Sequence[str] = (),
 ) -> ScanResult:
     """Count, judge and pack a result.
@@ -54,6 +55,8 @@ def summarise(
         What the patterns took its response to be, in words, where that is known.
     rounds
         What was decided about a second round and why, in words; empty where nothing was.
+    exposures
+        Figures of each exposure, as `scanner.exposures.Fused`; none where there was one.
     warnings
         Sentences for the operator; those about failed gates are added.
     """
@@ -133,6 +136,7 @@ def summarise(
             "bench": bench,
             **({"projector response": projector} if projector else {}),
             **({"rounds": rounds} if rounds else {}),
+            **({"exposures": [dict(e) for e in exposures]} if exposures else {}),
             "counts": counts,
             "frames": dict(frames),
             "timings_s": dict(timings_s),
@@ -142,6 +146,13 @@ def summarise(
             "versions": _versions(),
         },
         said,
+    )
+
+
+def exposures_said(result: ScanResult) -> str:
+    """What each exposure was good for, in words; empty where there was one."""
+    return ", ".join(
+        f"{1e3 * e['exposure_s']:.4g} ms for {100 * e['used_share']:.1f} %" for e in result.summary.get("exposures", ())
     )
 
 

@@ -12,6 +12,7 @@ from drivers import Bench, DisplayLatency, HardwareError, LatencyBound
 from scanner.acquisition import Acquisition, Listener
 from scanner.config import ConfigError, LoadedConfig, Problem, open_bench
 from scanner.decoding import Decoder
+from scanner.exposures import ExposureSeries, agree
 from scanner.folder import ResultFolder, write_result
 from scanner.methods import METHODS
 from scanner.quality import summarise
@@ -70,10 +71,11 @@ def run_scan(
             response = response_of(rig.metadata) if config.scan.correct_response else None
             light = None if response is None else response.values
             plan = replace(method.first_round(config.scan, bench.projector_size), response=light)
+            exposures = agree(bench, config.scan.exposures)
             rounds = config.scan.rounds_at_most(method.rounds)
-            with _begin_take(folder.path / "take", loaded, bench, rig, plan, rounds) as take:
+            with _begin_take(folder.path / "take", loaded, bench, rig, plan, rounds, exposures) as take:
                 decoder = Decoder(method, config.scan, bench.noise, rig)
-                acquisition = Acquisition(bench, method, config.scan, decoder, take, listener, light)
+                acquisition = Acquisition(bench, method, config.scan, decoder, take, listener, light, exposures)
                 maps = acquisition.run()
             simulated, name = bench.simulated, bench.name
         assert decoder.used_noise is not None
@@ -90,6 +92,7 @@ def run_scan(
             bench=name,
             projector=corrected_for(plan.response, rig.metadata),
             rounds=decoder.decision,
+            exposures=acquisition.exposure_figures,
             warnings=[*loaded.warnings, *acquisition.notes, *decoder.warnings],
         )
         write_result(
@@ -177,17 +180,25 @@ def _refused(loaded: LoadedConfig, what: str, remedy: str) -> ConfigError:
     return ConfigError.of([Problem(str(loaded.path), None, None, "rig", what, remedy)])
 
 
-def _begin_take(path: Path, loaded: LoadedConfig, bench: Bench, rig: Rig, plan: Plan, rounds: int) -> TakeWriter:
+def _begin_take(
+    path: Path,
+    loaded: LoadedConfig,
+    bench: Bench,
+    rig: Rig,
+    plan: Plan,
+    rounds: int,
+    exposures: ExposureSeries | None,
+) -> TakeWriter:
     noise = bench.noise
     return TakeWriter.create(
         path,
         frame_format=bench.frame_format,
-        slots=rounds * plan.frame_count,
+        slots=rounds * plan.frame_count * (1 if exposures is None else len(exposures)),
         manifest={
             "method": loaded.config.scan.method,
             "bench": dict(bench.describe()),
             "config": loaded.config.model_dump(mode="json"),
-            "plans": [plan.to_json()],
+            "plans": [plan.to_json() if exposures is None else exposures.recorded(plan)],
             "simulated": bench.simulated,
             "rig": rig.to_json(),
             "noise": None if noise is None else {"read_dn": noise.read_dn, "dn_per_electron": noise.dn_per_electron},

@@ -16,7 +16,7 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from scanner.acquisition import Progress, ScanState
-from scanner.quality import passed
+from scanner.quality import exposures_said, passed
 from scanner.result import ScanResult
 
 if TYPE_CHECKING:
@@ -159,6 +159,7 @@ class Terminal:
         rows: list[tuple[str, str]] = [
             ("method", result.method.upper() + ("   SIMULATED DATA" if result.simulated else "")),
             ("frames", frames),
+            *([("exposures", f"{said} of the pixels")] if (said := exposures_said(result)) else []),
             *([("rounds", str(result.summary["rounds"]))] if "rounds" in result.summary else []),
             ("points", f"{counts['points']:,} of {counts['pixels']:,} pixels"),
         ]

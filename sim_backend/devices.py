@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -221,6 +221,7 @@ class SimulatedCamera:
     ) -> None:
         self.name = "simulated camera"
         self._settings = settings
+        self._own_exposure_us = settings.exposure_us
         self._sensor = Sensor(settings)
         self._optics = optics
         self._projector = projector
@@ -256,8 +257,18 @@ class SimulatedCamera:
         return self._exposures
 
     def look_at(self, optics: Optics) -> None:
-        """Have another scene before the lens from now on; noise, faults and counts go on."""
-        self._optics = optics
+        """Have another scene before the lens from now on; noise, faults, counts and the exposure go on."""
+        self._optics = replace(optics, camera=self._settings)
+
+    def set_exposure(self, exposure_s: float) -> float:
+        """Expose so long until the camera is configured again; returns it, s."""
+        self._life.require("set_exposure", DeviceState.CONFIGURED)
+        self._expose_for(round(1e6 * exposure_s, 3))
+        return self.exposure_s
+
+    def _expose_for(self, exposure_us: float) -> None:
+        self._settings = self._settings.model_copy(update={"exposure_us": exposure_us})
+        self._optics = replace(self._optics, camera=self._settings)
 
     def open(self) -> None:
         """Connect.
@@ -276,6 +287,7 @@ class SimulatedCamera:
     def configure(self) -> FrameFormat:
         """Say what frames will look like."""
         self._life.move("configure")
+        self._expose_for(self._own_exposure_us)
         return self._sensor.frame_format
 
     def arm(self) -> None:

@@ -111,7 +111,8 @@ class ArrayBench:
         def at(x, y):
             return map_coordinates(spline, [y, x], order=3, mode="nearest", prefilter=False)
 
-        return self.ambient + self.gain * (at(self.x, self.y) + self.alpha * at(self.x_bounce, self.y_bounce))
+        bounce = self.alpha * at(self.x_bounce, self.y_bounce) if self.alpha.any() else 0.0
+        return self.ambient + self.gain * (at(self.x, self.y) + bounce)
 
     def expose(self, index, out) -> FrameStamp:
         number, self.exposures, self.dark = self.exposures, self.exposures + 1, False

@@ -25,8 +25,9 @@ from calibration.solver.refusal import CalibrationError
 from calibration.solver.result import Calibration
 from calibration.work import StepFailedError, Work
 from drivers import Bench
-from scanner.acquisition import AcquisitionError, ExposureError
+from scanner.acquisition import AcquisitionError
 from scanner.config import ScanSection
+from scanner.preflight import ExposureError
 from scanner.response import PROJECTOR_RESPONSE
 from scanner.session import DISPLAY_LATENCY
 

@@ -52,6 +52,7 @@ class GenICamCamera:
         self._rounded: dict[str, Any] = {}
         self._features: dict[str, Any] | None = None
         self._counters: dict[str, int] = {}
+        self._exposure_us = settings.exposure_us
 
     @property
     def state(self) -> DeviceState:
@@ -112,12 +113,26 @@ class GenICamCamera:
         """
         self._life.check("configure")
         self._features = None
+        self._exposure_us = self._settings.exposure_us
         frame_format, self._rounded = self._call("configure")
         if frame_format != self._format:
             self._drop_ring()
         self._format = frame_format
         self._life.move("configure")
         return frame_format  # type: ignore[no-any-return]
+
+    def set_exposure(self, exposure_s: float) -> float:
+        """Expose so long until the camera is configured again; returns what the camera has made of it, s.
+
+        Raises
+        ------
+        DeviceSettingError
+            The camera does not take it; the message quotes its own limits.
+        """
+        self._life.require("set_exposure", DeviceState.CONFIGURED)
+        made_us: float = self._call("set_exposure", round(1e6 * exposure_s, 3))
+        self._exposure_us = made_us
+        return made_us * 1e-6
 
     def arm(self) -> None:
         """Make the ring of frames ready and record the camera's features, once per configuration."""
@@ -225,6 +240,7 @@ class GenICamCamera:
             "state": self.state.name,
             "identity": {name: value for name, value in identity.items() if name != "access"},
             "settings": self._settings.model_dump(mode="json"),
+            "exposure_us": self._exposure_us,
             "rounded": {name: {"asked": asked, "made": made} for name, (asked, made) in self._rounded.items()},
             "features": self._features or {},
             "counters": self._counters,

@@ -38,6 +38,17 @@ def set_up(features: Features, settings: GenICamSettings) -> FrameFormat:
     return _read_back(features, settings)
 
 
+def set_exposure(features: Features, exposure_us: float) -> float:
+    """Set the exposure time; returns what the camera has made of it, µs.
+
+    Raises
+    ------
+    DeviceSettingError
+        The camera does not take it; the message quotes its own limits.
+    """
+    return float(features.write(features.first("ExposureTime", "ExposureTimeAbs") or "ExposureTime", exposure_us))
+
+
 def _set_geometry(features: Features, settings: GenICamSettings) -> None:
     # A window that is not at the corner limits its own size.
     features.write_if_there(["OffsetX"], 0)
@@ -55,7 +66,7 @@ def _set_geometry(features: Features, settings: GenICamSettings) -> None:
 def _set_light(features: Features, settings: GenICamSettings) -> None:
     if settings.exposure_us is not None:
         features.write_if_there(["ExposureMode"], "Timed")
-        features.write(features.first("ExposureTime", "ExposureTimeAbs") or "ExposureTime", settings.exposure_us)
+        set_exposure(features, settings.exposure_us)
     if settings.gain_db is not None:
         features.write(features.first("Gain", "GainAbs") or "Gain", settings.gain_db)
     if settings.gain_raw is not None:

@@ -18,7 +18,7 @@ from drivers.errors import (
     HardwareError,
 )
 from drivers.genicam.camera_time import CameraTime
-from drivers.genicam.configuration import set_up
+from drivers.genicam.configuration import set_exposure, set_up
 from drivers.genicam.discovery import ProducerReport, choose
 from drivers.genicam.features import Features, Value
 from drivers.genicam.library import is_genicam_error, kept_interrupt_handler, load_harvesters, reason, silence_output
@@ -114,6 +114,12 @@ class GenICamServer:
             frame_format = set_up(self._features, self._settings)
             self._time = CameraTime(self._features)
         return frame_format, dict(self._features.rounded)
+
+    def set_exposure(self, exposure_us: float) -> float:
+        """Set the exposure; returns what the camera has made of it, µs."""
+        assert self._features is not None
+        with self._talking("setting the exposure"):
+            return set_exposure(self._features, exposure_us)
 
     def snapshot(self) -> dict[str, Value]:
         """All features that can be read."""

@@ -101,6 +101,33 @@ _Frequency = Annotated[float, BeforeValidator(_fraction), _number_schema(exclusi
 _Frequencies = Annotated[tuple[_Frequency, ...], Field(strict=False, min_length=1), AfterValidator(_check_frequencies)]
 
 
+MOST_EXPOSURES = 8
+"""Exposures of one scan."""
+
+
+def _check_exposures(values: tuple[float, ...]) -> tuple[float, ...]:
+    refusals = [
+        _refusal((i,), f"found {show(value)}, expected a factor above 0", "write how many times the bench's exposure")
+        for i, value in enumerate(values)
+        if value <= 0
+    ]
+    if len(set(values)) < len(values):
+        refusals.append(_refusal((), f"found {show(values)}, expected each exposure once", "remove the repeated ones"))
+    if len(values) == 1 and values[0] > 0 and values[0] != 1:
+        what = f"found {show(values)}, expected 1 where there is one exposure only"
+        refusals.append(_refusal((), what, "change the camera's exposure_us in the section bench, or add an exposure"))
+    _refuse(refusals)
+    return values
+
+
+_Factor = Annotated[float, BeforeValidator(_fraction), _number_schema(exclusiveMinimum=0)]
+_Exposures = Annotated[
+    tuple[_Factor, ...],
+    Field(strict=False, min_length=1, max_length=MOST_EXPOSURES),
+    AfterValidator(_check_exposures),
+]
+
+
 class PeriodsByAxis(_Section):
     """Fringe periods of each axis, px."""
 
@@ -205,6 +232,11 @@ class ScanSection(_Section):
     )
     lit_margin_px: float = Field(
         6, ge=0, le=200, description="By how much the region that round two lights is grown, projector px."
+    )
+    exposures: _Exposures = Field(
+        (1.0,),
+        description="Exposures of every round, each times that of the bench: [1, 1/4] for shiny parts, [4, 1, 1/4] "
+        "with dark ones. Each takes all frames again; a pixel is measured by those in which it does not saturate.",
     )
     attempts: int = Field(
         3, ge=1, le=100, description="How often a sequence is captured, at most, until its frames pass the check."

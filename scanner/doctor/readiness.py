@@ -29,6 +29,8 @@ _FASTEST_HZ = 60.0
 _FRAMES_ON_THEIR_WAY = 16
 # Measured peak of decoding 18 sequences of 12 frames: 535 bytes for each camera pixel.
 _BYTES_PER_PIXEL, _BYTES_PER_PIXEL_AND_SEQUENCE = 100, 30
+# Mean, gain and what saturates; the fused frames of a sequence come to them.
+_BYTES_PER_PIXEL_AND_EXPOSURE = 12
 
 
 @dataclass(frozen=True)
@@ -43,17 +45,20 @@ class Planned:
         (width, height) of a frame, px.
     pixel_bytes
         1 or 2.
+    exposures
+        How many a round has.
     """
 
     plan: Plan
     rounds: int
     size: tuple[int, int]
     pixel_bytes: int
+    exposures: int = 1
 
     @property
     def frames(self) -> int:
         """Frames of all rounds."""
-        return self.rounds * self.plan.frame_count
+        return self.rounds * self.plan.frame_count * self.exposures
 
     @property
     def frame_bytes(self) -> int:
@@ -65,6 +70,8 @@ class Planned:
         """About the largest memory of the scan: two sequences of frames, and what decoding keeps of every sequence."""
         longest = max(len(s) for s in self.plan.sequences)
         kept = _BYTES_PER_PIXEL + _BYTES_PER_PIXEL_AND_SEQUENCE * len(self.plan.sequences)
+        if self.exposures > 1:
+            kept += 4 * longest + _BYTES_PER_PIXEL_AND_EXPOSURE * self.exposures
         return 2 * longest * self.frame_bytes + kept * self.size[0] * self.size[1]
 
 
@@ -216,7 +223,7 @@ def _planned(loaded: LoadedConfig, rig: Rig | None) -> Planned | Finding:
     except OperatorError as error:
         return Finding("configuration", "plan", Verdict.FAULT, error.message, error.remedy)
     rounds = scan.rounds_at_most(method.rounds)
-    return Planned(plan, rounds, (frame[0], frame[1]), 1 if _bits(camera) <= 8 else 2)
+    return Planned(plan, rounds, (frame[0], frame[1]), 1 if _bits(camera) <= 8 else 2, len(scan.exposures))
 
 
 def _size_of(section: Any) -> tuple[int, int] | None:

@@ -11,6 +11,7 @@ from importlib.resources import files
 import matplotlib as mpl
 import numpy as np
 
+from scanner.quality import exposures_said
 from scanner.report import plates
 from scanner.report.figures import Scale, picture, shrink
 from scanner.report.statistics import statistics
@@ -89,6 +90,7 @@ def _header(result: ScanResult, title: str) -> str:
         "Date": created and str(created).replace("T", " ").replace("+00:00", " UTC"),
         "Camera": "{1} × {0} px".format(*result.maps.flags.shape),
         "Projector": result.summary.get("projector response"),
+        "Exposures": exposures_said(result) and f"{exposures_said(result)} of the pixels",
         "Rounds": result.summary.get("rounds"),
     }
     listed = "".join(f"<div><dt>{k}</dt><dd>{escape(str(v))}</dd></div>" for k, v in facts.items() if v)

@@ -6,10 +6,10 @@ Layout of the folder, a contract with tools outside of this repository::
     frames.bin      preallocated slots of ``stride`` bytes, a multiple of 4096; slot n begins at n · stride
     journal.jsonl   append-only, one write per record
 
-**manifest.json** holds ``schema`` (1), ``uid``, ``created`` (ISO 8601, UTC), ``method``, ``bench``, ``config``,
-``plans`` (those known at the start, round one first), ``simulated``, ``rig``, ``noise``, ``width``, ``height``,
-``bits``, ``dtype`` (NumPy's, with byte order), ``shape`` (height, width), ``stride`` and ``manifest_xxh3``, the
-checksum of all the rest as sorted, compact JSON.
+**manifest.json** holds ``schema`` (1; 2 with several exposures), ``uid``, ``created`` (ISO 8601, UTC), ``method``,
+``bench``, ``config``, ``plans`` (those known at the start, round one first), ``simulated``, ``rig``, ``noise``,
+``width``, ``height``, ``bits``, ``dtype`` (NumPy's, with byte order), ``shape`` (height, width), ``stride`` and
+``manifest_xxh3``, the checksum of all the rest as sorted, compact JSON.
 
 **journal.jsonl** holds one JSON object per line. Its last member, ``record_xxh3``, is the checksum of all bytes
 of the line before ``,"record_xxh3"``. Checksums are XXH3, 64 bits, in hexadecimal. The other members, by ``kind``:
@@ -26,6 +26,10 @@ note, state         ``text``; ``name``: the operator's log and the scan's state 
 resumed             The recording goes on after it was cut off or ended.
 end                 ``status`` (completed, cancelled, failed), ``reason``
 =================== =========================================================================================
+
+A plan that is taken at several exposures has a member ``exposures`` beside those of `scanner.patterns.Plan.to_json`:
+``reference_s``, the bench's own exposure, and ``made_s``, those of the round, in s. Its ``sequences`` are all that was
+projected: those of the first exposure, then the same at the second, and so on.
 
 A record with ``torn`` follows so many bytes that are what is left of a record that was not written whole; it
 begins with a line feed of its own, so that empty lines may occur. All records but ``frame`` carry ``t_s``, s on

@@ -14,7 +14,8 @@ import xxhash
 from drivers.devices import FrameStamp
 from drivers.errors import OperatorError
 
-SCHEMA = 1
+SCHEMA, SCHEMA_OF_EXPOSURES = 1, 2
+"""Of takes with one exposure, and of those whose plans have several: an older version must not read them as one."""
 MANIFEST, FRAMES, JOURNAL = "manifest.json", "frames.bin", "journal.jsonl"
 
 EndStatus = Literal["completed", "cancelled", "failed"]
@@ -80,6 +81,13 @@ class RecordedSequence:
     def slots(self) -> tuple[int, ...]:
         """Slots in the order of the plan."""
         return tuple(f.slot for f in self.frames)
+
+
+def schema_of(manifest: Document) -> int:
+    """Schema that a take with these ``plans`` has."""
+    plans = manifest.get("plans")
+    several = isinstance(plans, list) and any(isinstance(plan, dict) and "exposures" in plan for plan in plans)
+    return SCHEMA_OF_EXPOSURES if several else SCHEMA
 
 
 def compact(document: Any) -> bytes:
@@ -218,10 +226,11 @@ def read_manifest(file: Path) -> tuple[dict[str, Any], list[str]]:
         raise TakeError(f"{file} is damaged, it is no JSON document: {error}", restore) from None
     if not isinstance(manifest, dict) or not isinstance(manifest.get("schema"), int):
         raise TakeRefusedError(f"{file} is not the manifest of a take", "Name a folder that a scan recorded.")
-    if manifest["schema"] > SCHEMA:
+    known = schema_of(manifest)
+    if manifest["schema"] > known:
         raise TakeRefusedError(
             f"{file.parent} was recorded by a newer version of this program: its schema is {manifest['schema']}, "
-            f"this version reads up to {SCHEMA}",
+            f"this version reads up to {known}",
             "Update this program to process it.",
         )
     match manifest:

@@ -29,7 +29,6 @@ from scanner.take.journal import (
     JOURNAL,
     MANIFEST,
     PAGE,
-    SCHEMA,
     Document,
     EndStatus,
     FrameRecord,
@@ -38,6 +37,7 @@ from scanner.take.journal import (
     TakeRefusedError,
     compact,
     digest,
+    schema_of,
     seal,
 )
 from scanner.take.reader import Take
@@ -127,7 +127,7 @@ class TakeWriter:
             raise ValueError(f"the manifest of a take lacks {', '.join(lacking)}")
         self = cls(Path(path), frame_format, clock)
         document = {
-            "schema": SCHEMA,
+            "schema": schema_of(manifest),
             "uid": uuid.uuid4().hex,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
             "rig": None,

@@ -14,6 +14,7 @@ import pytest
 from cameras import left_behind
 
 from drivers import (
+    AdjustableCamera,
     Camera,
     DeviceSettingError,
     DeviceState,
@@ -205,3 +206,22 @@ def test_a_place_may_be_any_view(ready):
     camera.fetch(wide[:, ::2], PATIENCE_S)
     assert wide[:, ::2].any()
     assert not wide[:, 1::2].any()
+
+
+def test_an_exposure_that_can_be_changed_stays_until_the_next_configuration(ready):
+    camera, out = ready
+    if not isinstance(camera, AdjustableCamera) or camera.describe().get("exposure_us") is None:
+        pytest.skip("its exposure cannot be changed, or is not known")
+    with pytest.raises(IllegalCallError):
+        camera.set_exposure(0.002)
+    own_s = 1e-6 * camera.describe()["exposure_us"]
+    for exposure_s in (own_s / 2, own_s):
+        camera.stop()
+        assert camera.set_exposure(exposure_s) == pytest.approx(exposure_s, rel=0.01)
+        camera.arm()
+        camera.start()
+        shot(camera, out)
+    camera.stop()
+    camera.set_exposure(own_s / 2)
+    camera.configure()
+    assert camera.describe()["exposure_us"] == pytest.approx(1e6 * own_s)

@@ -15,13 +15,12 @@ from scanner.acquisition import (
     TRANSITIONS,
     Acquisition,
     AcquisitionError,
-    ExposureError,
     ScanState,
-    check_exposure,
 )
 from scanner.config import GatesSection, ScanSection
 from scanner.decoding import Decoder
 from scanner.methods import METHODS
+from scanner.preflight import ExposureError, check_exposure
 from scanner.processing import process_take
 from scanner.result import Flag
 from scanner.take import Take, TakeWriter
