@@ -64,7 +64,7 @@ def write(path: Path) -> None:
         open3d.utility.Vector3dVector(vertices), open3d.utility.Vector3iVector(triangles.astype(np.int32))
     )
     mesh.compute_triangle_normals()
-    if not open3d.io.write_triangle_mesh(str(path), mesh):
+    if not open3d.io.write_triangle_mesh(path, mesh):
         raise SystemExit(f"{path} could not be written")
 
 
