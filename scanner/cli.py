@@ -212,7 +212,7 @@ def paper(
     terminal = Terminal(quiet)
     wanted = Wanted(seeds, width_px)
     if small:
-        wanted = replace(wanted, seeds=1, width_px=width_px or 256, small=True)
+        wanted = replace(wanted, seeds=1, width_px=width_px or 256, noise_shape=(192, 256))
     command = ["scan", "paper", "--configs", str(configs), *(["--small"] if small else ["--seeds", str(seeds)])]
     command += [] if width_px is None else ["--width-px", str(width_px)]
 

@@ -33,7 +33,7 @@ class NoiseStudy:
         return float("nan") if value is None else float(value)
 
 
-def study_noise(folder: Path, seeds: int, small: bool, report: Callable[[str], None]) -> NoiseStudy:
+def study_noise(folder: Path, seeds: int, shape: tuple[int, int], report: Callable[[str], None]) -> NoiseStudy:
     """Make the study, or take the one that is there.
 
     Parameters
@@ -42,12 +42,11 @@ def study_noise(folder: Path, seeds: int, small: bool, report: Callable[[str], N
         For tables and pictures.
     seeds
         Independent pictures of every pair; their seeds are 201, 202, …, which nothing was chosen on.
-    small
-        Pictures of 256 × 192 px in place of 512 × 384.
+    shape
+        Rows and columns of a picture.
     report
         Is told what is being done.
     """
-    shape = (192, 256) if small else (384, 512)
     numbers = list(range(201, 201 + seeds))
     asked = {"seeds": numbers, "shape": list(shape), "false_alarm_rate": FALSE_ALARM_RATE}
     path = folder / DETECTION_STUDY
@@ -62,9 +61,8 @@ def study_noise(folder: Path, seeds: int, small: bool, report: Callable[[str], N
     figures.maps_figure(examples, pairs, folder / MAPS)
     figures.roc_figure(examples, pairs, folder / ROC)
     _fringes(shape, folder / FRINGES)
-    document = {**asked, "not_counted_px": detection.NEAR_PX, "pairs": pairs}
-    write_json(path, document)
-    return NoiseStudy(folder, document)
+    write_json(path, {**asked, "not_counted_px": detection.NEAR_PX, "pairs": pairs})
+    return NoiseStudy(folder, json.loads(path.read_text("utf-8")))
 
 
 def _fringes(shape: tuple[int, int], path: Path, alpha: float = 0.4) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
 
 from scanner.comparison.page import header, page, sections
-from scanner.paper.claims import Experiment
+from scanner.paper.claims import Experiment, Limit
 from scanner.paper.noise import FRINGES, MAPS, ROC, NoiseStudy
 from scanner.report.wording import figure, number, per_cent, section, table
 from scanner.studies.detection import ALPHAS, SIGMAS_DN
@@ -25,22 +26,35 @@ _PAPER_SAYS = {
 _LEAST_IOU = 0.95
 
 
-def render(experiments: Sequence[Experiment], noise: NoiseStudy | None, command: str) -> str:
+@dataclass(frozen=True)
+class Chapter:
+    """One experiment as it stands on the page; the maps that its pictures were made from are not kept."""
+
+    title: str
+    facts: Mapping[str, str]
+    simulated: bool
+    limits: Sequence[Limit]
+    parts: Sequence[str]
+
+
+def chapter(e: Experiment, count: int) -> Chapter:
+    """Write experiment number ``count``, from 1."""
+    c = e.comparison
+    heading = _heading(f"experiment-{count}", f"Experiment {count} · {escape(c.title)}")
+    return Chapter(c.title, c.facts, c.simulated, e.limits(), [heading, _beside_the_paper(e, count), *sections(c)])
+
+
+def render(chapters: Sequence[Chapter], noise: NoiseStudy | None, command: str) -> str:
     """Write the page, as far as the experiments go; it loads nothing from anywhere."""
-    parts = [_head(experiments, command), _promises(experiments, noise)]
-    for number_, e in enumerate(experiments, 1):
-        parts.append(
-            _heading(f"experiment-{number_}", f"Experiment {number_} · {escape(e.comparison.title[1:].strip())}")
-        )
-        parts.append(_beside_the_paper(e, number_))
-        parts += sections(e.comparison)
+    parts = [_head(chapters, command), _promises(chapters, noise)]
+    parts += [part for one in chapters for part in one.parts]
     if noise is not None:
         parts += [_heading("noise", "Noise study · Figs. 22 and 23"), *_noise(noise)]
-    return page(_TITLE, *parts, simulated=any(e.comparison.simulated for e in experiments))
+    return page(_TITLE, *parts, simulated=any(one.simulated for one in chapters))
 
 
-def _head(experiments: Sequence[Experiment], command: str) -> str:
-    first = experiments[0].comparison if experiments else None
+def _head(chapters: Sequence[Chapter], command: str) -> str:
+    first = chapters[0] if chapters else None
     facts = {
         "Paper": "Micro-frequency shifting, Opt. Express 27(20) 28293 (2019)",
         "Date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -52,19 +66,18 @@ def _head(experiments: Sequence[Experiment], command: str) -> str:
         "frames of its own plan; the row without bounces is the same scene with what throws them painted black. The "
         "numbers of the paper's Tables 1 and 2 are lost, so its statements are compared, not its figures.</p>"
     )
-    simulated = any(e.comparison.simulated for e in experiments)
-    return header(_TITLE, facts, command, simulated) + said
+    return header(_TITLE, facts, command, any(one.simulated for one in chapters)) + said
 
 
 def _heading(key: str, title: str) -> str:
     return f'<h1 class="part" id="{key}">{title}</h1>'
 
 
-def _promises(experiments: Sequence[Experiment], noise: NoiseStudy | None) -> str:
+def _promises(chapters: Sequence[Chapter], noise: NoiseStudy | None) -> str:
     """Everything that the project promises for these experiments, in one table."""
     rows = []
-    for count, e in enumerate(experiments, 1):
-        for limit in e.limits():
+    for count, one in enumerate(chapters, 1):
+        for limit in one.limits:
             shown = (number, number) if limit.limit > 1 else (per_cent, per_cent)
             cells = (
                 f'<a href="#experiment-{count}">{count}</a>',

@@ -13,7 +13,7 @@ from scanner.config import ConfigError, LoadedConfig, load_config
 from scanner.folder import REPORT, write_json
 from scanner.paper.claims import STATEMENTS, Experiment
 from scanner.paper.noise import NoiseStudy, study_noise
-from scanner.paper.page import render
+from scanner.paper.page import Chapter, chapter, render
 from scanner.paper.shelf import PAPER, Shelf, open_shelf
 from scanner.result import ScanResult
 
@@ -25,16 +25,16 @@ class Wanted:
     Parameters
     ----------
     seeds
-        Scans of every method in every experiment, and half the pictures of every pair of the noise study.
+        Scans of every method in every experiment, and pictures of every pair of the noise study.
     width_px
         Columns of the camera's picture; the rows follow the file's. None: the file's own.
-    small
-        A small picture in the noise study.
+    noise_shape
+        Rows and columns of the pictures of the noise study.
     """
 
     seeds: int = 3
     width_px: int | None = None
-    small: bool = False
+    noise_shape: tuple[int, int] = (384, 512)
 
 
 @dataclass(frozen=True)
@@ -91,17 +91,18 @@ def run_paper(
     """
     prepared = [_prepare(path, wanted) for path in _files(configs)]
     folder = open_shelf(out, overwrite)
-    experiments: list[Experiment] = []
+    chapters: list[Chapter] = []
+    found: dict[str, Any] = {}
     noise: NoiseStudy | None = None
 
     def write(complete: bool) -> dict[str, Any]:
         document: dict[str, Any] = {
             "complete": complete,
             "command": shlex.join(command),
-            "experiments": {e.name: e.to_json() for e in experiments},
+            "experiments": found,
             "noise": None if noise is None else noise.document,
         }
-        (folder / REPORT).write_text(render(experiments, noise, shlex.join(command)), encoding="utf-8")
+        (folder / REPORT).write_text(render(chapters, noise, shlex.join(command)), encoding="utf-8")
         write_json(folder / PAPER, document)
         return document
 
@@ -119,10 +120,12 @@ def run_paper(
         section = one.loaded.config.compare
         compared = compare_scans(one.scans, make, section, shelf)
         comparison = described(compared, one.scans, section, _title(one.loaded), f"{one.name}-")
-        experiments.append(Experiment(one.name, comparison, STATEMENTS.get(one.name, ())))
+        experiment = Experiment(one.name, comparison, STATEMENTS.get(one.name, ()))
+        chapters.append(chapter(experiment, number))
+        found[one.name] = experiment.to_json()
         write_json(folder / one.name / "comparison.json", document_of(compared))
         write(complete=False)
-    noise = study_noise(folder / "noise", wanted.seeds, wanted.small, report)
+    noise = study_noise(folder / "noise", wanted.seeds, wanted.noise_shape, report)
     return write(complete=True)
 
 
@@ -158,4 +161,4 @@ def _resized(loaded: LoadedConfig, width: int) -> Mapping[str, object]:
 
 
 def _title(loaded: LoadedConfig) -> str:
-    return loaded.path.stem.replace("_", " ")
+    return loaded.path.stem.lstrip("0123456789").replace("_", " ").strip()
