@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from scanner.comparison.page import Comparison
+from scanner.comparison.running import REFERENCE
 from scanner.report.wording import number, per_cent
 
 MOST_RATIO = 1.15
@@ -175,11 +176,14 @@ def _on_the_ball(e: Experiment) -> tuple[bool | None, str]:
     return shares["mfs_paper"] > 0.02, said
 
 
+_REFERENCE = f"mfs, {REFERENCE}"
+
+
 def _weak(e: Experiment) -> tuple[bool | None, str]:
     said, holds = [], True
     for window in e.windows:
-        rmse = {m: e.value(window, m, "rmse_mm") for m in ("tps", "mps", "mfs")}
-        holds &= rmse["tps"] > 1.5 * rmse["mfs"]
+        rmse = {m: e.value(window, m, "rmse_mm") for m in ("tps", "mps", "mfs", _REFERENCE)}
+        holds &= min(rmse["tps"], rmse["mps"]) > 1.5 * rmse[_REFERENCE]
         said.append(f"{window}: RMSE, mm: " + ", ".join(f"{m} {number(v)}" for m, v in rmse.items()))
     return holds, "; ".join(said)
 
