@@ -176,6 +176,21 @@ class SceneTruth(Protocol):
         """Pixels that mix two surfaces, or light and shadow."""
         ...
 
+    @property
+    def places(self) -> Mapping[str, NDArray[np.bool_]]:
+        """Masks of what can be told apart by name: parts, and windows that results are judged in."""
+        ...
+
+    @property
+    def bounce_x(self) -> NDArray[np.floating[Any]]:
+        """Mean projector column, px, of the light that a pixel sees over mirrors and lobes."""
+        ...
+
+    @property
+    def bounce_y(self) -> NDArray[np.floating[Any]]:
+        """Mean projector row, px, as `bounce_x`."""
+        ...
+
 
 @runtime_checkable
 class TruthTeller(Protocol):

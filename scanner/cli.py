@@ -1,4 +1,4 @@
-"""The command line: `scan`, and `process`, `compare`, `plan`, `study`, `doctor`, `preview`, `latency`, `schema` below.
+"""The command line: `scan`, and `process`, `compare`, `paper`, `plan`, `study`, `doctor`, `preview`, `latency` below.
 
 Exit codes: 0 done; 2 bad configuration or usage; 3 hardware; 4 the scan ran but its result fails its own quality gates;
 130 interrupted. Everything heavy is imported where it is used, so that `scan --help` answers at once.
@@ -166,7 +166,9 @@ def compare(
     if fit is not None:
         changes["compare.fit"] = fit
     section = load_config(config, changes).config.compare
-    scans = plan_scans(lambda more: load_config(config, {**changes, **more}), section.methods, section.seeds)
+    scans = plan_scans(
+        lambda more: load_config(config, {**changes, **more}), section.methods, section.seeds, section.reference
+    )
     known = None if reuse is None else read_result(reuse)
     command = ["scan", "compare", "--config", str(config), "--methods", methods or ",".join(section.methods)]
     command += ["--seeds", str(section.seeds), *(word for s in sets or [] for word in ("--set", s))]
@@ -174,13 +176,51 @@ def compare(
     with ComparisonFolder(out or _default_out("comparison"), overwrite=overwrite) as folder:
 
         def scan(planned: Planned) -> ScanResult:
-            if known is not None and planned.number == 0 and planned.method == known.method:
+            if known is not None and planned.number == 0 and planned.name == known.method:
                 return known
-            terminal.say([f"{planned.method}, scan {planned.number + 1} of {section.seeds}"])
+            terminal.say([f"{planned.name}, scan {planned.number + 1} of {section.seeds}"])
             return _scan(planned.loaded, folder.path / planned.folder, False, terminal)[0]
 
         rows = run_comparison(scans, scan, section, folder, command)
     terminal.comparison(rows, folder.out)
+
+
+@app.command()
+@interruptible
+def paper(
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder; one that an earlier run left is gone on with.")
+    ] = Path("paper-result"),
+    configs: Annotated[Path, typer.Option("--configs", help="Folder of the experiments' bench files.")] = Path(
+        "configs/paper"
+    ),
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Scans of each method in each experiment.")] = 3,
+    width_px: Annotated[
+        int | None, typer.Option("--width-px", min=64, help="Columns of the camera; default: those of the files.")
+    ] = None,
+    small: Annotated[bool, typer.Option("--small", help="A quick look: 256 columns, one seed.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Begin anew instead of going on.")] = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Make the experiments of the paper again, all methods side by side, into one report beside what it says."""
+    from dataclasses import replace
+
+    from scanner.comparison.running import Planned
+    from scanner.paper.running import Wanted, run_paper
+    from scanner.terminal import Terminal
+
+    terminal = Terminal(quiet)
+    wanted = Wanted(seeds, width_px)
+    if small:
+        wanted = replace(wanted, seeds=1, width_px=width_px or 256, noise_shape=(192, 256))
+    command = ["scan", "paper", "--configs", str(configs), *(["--small"] if small else ["--seeds", str(seeds)])]
+    command += [] if width_px is None else ["--width-px", str(width_px)]
+
+    def scan(planned: Planned, place: Path) -> ScanResult:
+        return _scan(planned.loaded, place, True, terminal)[0]
+
+    document = run_paper(configs, out, wanted, scan, lambda text: terminal.say([text]), overwrite, command)
+    terminal.paper(document, out)
 
 
 @app.command()

@@ -219,7 +219,7 @@ class DocumentFolder(OutputFolder):
 
     def write_json(self, name: str, document: Mapping[str, Any]) -> None:
         """Write a JSON-ready document; NaN becomes null."""
-        _write_text(self.path / name, _json(document))
+        write_json(self.path / name, document)
 
 
 class ComparisonFolder(DocumentFolder):
@@ -362,6 +362,11 @@ def _write_maps(file: Path, maps: Maps) -> None:
     """Write every map that there is under its name; not compressed, because noise hardly shrinks (to 86 %)."""
     arrays = {f.name: getattr(maps, f.name) for f in fields(maps)}
     np.savez(file, **{name: array for name, array in arrays.items() if array is not None})
+
+
+def write_json(file: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON-ready document; NaN becomes null."""
+    _write_text(file, _json(document))
 
 
 def _write_text(file: Path, text: str) -> None:

@@ -22,6 +22,9 @@ _SMALLEST_SURFACE = 12
 _CONTINUOUS_PX = 3.0
 """On one surface the step to the next camera pixel exceeds twice the usual one by no more than this, projector px."""
 
+_REACH_PITCHES = 2.5
+"""The lit set is grown by so many camera pixels at least: one sees half its own width and three σ of the blur."""
+
 _DENSITY = 3
 """A projector pixel is believed when at least this many coordinates fall on it and its 8 neighbours."""
 
@@ -57,7 +60,8 @@ def sound_mask(
     """
     gap = max(1, int(np.ceil(pitch_px)))
     core = _close(_believed(_splat(x, y, size), gap), gap)
-    reach = int(np.ceil(margin_px))
+    # A camera pixel sees beyond its own place: a coarse camera needs more than the margin.
+    reach = int(np.ceil(max(margin_px, _REACH_PITCHES * pitch_px)))
     grown = cv2.dilate(core.astype(np.uint8), _disc(reach)) > 0 if reach else core
     if emitters is not None:
         source = _close(_believed(_splat(*emitters, size), gap), gap)

@@ -190,9 +190,11 @@ class Terminal:
         columns = {
             "coverage": ("cov %", 100, "{:.1f}"),
             "std_mm": ("std mm", 1, "{:.4g}"),
+            "std_ratio": ("÷ ref", 1, "{:.3g}"),
             "median_mm": ("med mm", 1, "{:.3g}"),
             "rmse_mm": ("rmse mm", 1, "{:.4g}"),
             "wrong_fringes": ("wrong %", 100, "{:.2f}"),
+            "close": ("<0.1px %", 100, "{:.2f}"),
             "precision": ("prec", 1, "{:.3f}"),
             "recall": ("recall", 1, "{:.3f}"),
             "auc": ("AUC", 1, "{:.3f}"),
@@ -218,6 +220,20 @@ class Terminal:
             self.console.print()
             self.console.print(table)
         self.console.print(f"report, with intervals and figures: {path / 'report.html'}", markup=False)
+
+    def paper(self, document: Mapping[str, Any], path: Path) -> None:
+        """Print what the paper's experiments reach, and where the report is."""
+        table = Table(title="the paper's experiments", title_justify="left", box=None, pad_edge=False)
+        for name in ("experiment", "where", "what", "found", "limit", ""):
+            table.add_column(name, justify="right" if name in ("found", "limit") else "left")
+        for name, experiment in document["experiments"].items():
+            for limit in experiment["limits"]:
+                verdict = "met" if limit["met"] else "missed"
+                cells = (limit["window"], limit["what"], f"{limit['found']:.4g}", f"{limit['limit']:g}", verdict)
+                table.add_row(name, *cells)
+        self.console.print()
+        self.console.print(table)
+        self.console.print(f"report, with tables and figures: {path / 'report.html'}", markup=False)
 
     def detection_study(self, document: Mapping[str, Any], path: Path) -> None:
         """Print the tables of a detection study."""

@@ -90,7 +90,8 @@ def truth_of(settings: SceneSettings, presented: Mapping[str, Any] | None = None
 
     if presented is not None:
         settings = settings.model_copy(update={"scene": scene_of(presented)})
-    return Truth(Optics.of(settings, _transports().of(settings)), settings.rig(), settings.scene.windows())
+    optics = Optics.of(settings, _transports().of(settings))
+    return Truth(optics, settings.rig(), settings.scene.windows(), settings.scene.part_surfaces())
 
 
 kind: BenchKind = SimulatedBenchKind()

@@ -62,3 +62,28 @@ def joined(solids: Sequence[tuple[Array, Triangles]]) -> tuple[Array, Triangles]
         np.concatenate([vertices for vertices, _ in solids]),
         np.concatenate([triangles + first for (_, triangles), first in zip(solids, begin, strict=False)]),
     )
+
+
+def prism(profile: Sequence[tuple[float, float]], start: float, stop: float) -> tuple[Array, Triangles]:
+    """A polygon of the y-z plane drawn out along x.
+
+    Parameters
+    ----------
+    profile
+        Three or more (y, z) in mm, counterclockwise as seen from +x; all of it can be seen from the first point.
+    start, stop
+        Where it begins and ends along x, mm.
+
+    Returns
+    -------
+    Vertices (n, 3) in mm and triangles (m, 3), fronts outwards.
+    """
+    count = len(profile)
+    vertices = np.array([(x, y, z) for x in (start, stop) for y, z in profile], np.float64)
+    fan = np.array([(0, k, k + 1) for k in range(1, count - 1)])
+    here = np.arange(count)
+    ahead = np.roll(here, -1)
+    sides = np.concatenate(
+        [np.stack((here, ahead, ahead + count), 1), np.stack((here, ahead + count, here + count), 1)]
+    )
+    return vertices, np.concatenate((fan[:, ::-1], fan + count, sides))

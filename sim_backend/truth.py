@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -34,11 +34,14 @@ class Truth:
         Where camera and projector truly are.
     windows
         The scene's windows, by name.
+    parts
+        Numbers of the surfaces of the scene's parts, by name, as in `object_id`.
     """
 
     optics: Optics
     rig: Rig
     windows: Mapping[str, Window] = field(default_factory=dict)
+    parts: Mapping[str, Sequence[int]] = field(default_factory=dict)
 
     @property
     def x_p(self) -> Floats:
@@ -68,6 +71,12 @@ class Truth:
     def in_window(self, name: str) -> NDArray[np.bool_]:
         """Pixels that see the scene's window of this name; ``KeyError`` for one that it does not have."""
         return self.windows[name].holds(self.points, self.object_id)
+
+    @property
+    def places(self) -> Mapping[str, NDArray[np.bool_]]:
+        """Pixels of every part and in every window, by name."""
+        parts = {name: np.isin(self.object_id, list(numbers)) for name, numbers in self.parts.items()}
+        return parts | {name: self.in_window(name) for name in self.windows}
 
     @cached_property
     def edge(self) -> NDArray[np.bool_]:

@@ -51,16 +51,14 @@ def twins_of(settings: _Settings) -> tuple[Twin[_Settings], ...]:
 
     No paint keeps a part from throwing light on itself; where it may, light is reflected once only, in addition.
     """
-    parts = settings.scene.parts()
-    twins, first = [], 0
+    parts, numbers = settings.scene.parts(), settings.scene.part_surfaces()
+    twins = []
     for name, some in parts.items():
-        numbers = tuple(range(first, first + len(some)))
-        first += len(some)
         if name not in (settings.scene.MEASURED or settings.scene.part_names):
             continue
         others = tuple(other for other in parts if other != name)
         twin = settings.model_copy(update={"scene": settings.scene.model_copy(update={"blackened": others})})
         if len(some) > 1 or some[0].lights_itself:
             twin = without_bounces(twin)
-        twins.append(Twin(twin, name, numbers))
+        twins.append(Twin(twin, name, numbers[name]))
     return tuple(twins)

@@ -128,7 +128,7 @@ def test_plane_fit_beside_the_other_methods_and_the_scene_without_mirror(scan_si
         print("\nbounce region after a plane fit:")
         for name, (std, share) in rows.items():
             print(f"  {name:20s} std {std:9.4f} mm   {100 * share:5.1f} % of the region")
-    assert rows["MFS"][0] <= 1.3 * rows["MFS without mirror"][0]
+    assert rows["MFS"][0] <= 1.15 * rows["MFS without mirror"][0]
     assert rows["MFS"][1] >= 0.97
     assert min(rows[name][0] for name in ("TPS", "MPS", "MPS, F + 2")) > 3 * rows["MFS"][0]
 

@@ -2,7 +2,7 @@
 
 from scanner.comparison.detection import DetectionFigures, judge_detection
 from scanner.comparison.fitting import fit_plane, fit_sphere
-from scanner.comparison.judging import FIGURES, Row, Trial, distances, judge, rows_of
+from scanner.comparison.judging import FIGURES, Row, Trial, beside_reference, distances, judge, rows_of
 from scanner.comparison.windows import Window, largest_region, windows_of
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "Row",
     "Trial",
     "Window",
+    "beside_reference",
     "distances",
     "fit_plane",
     "fit_sphere",

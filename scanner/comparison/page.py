@@ -16,6 +16,7 @@ from scanner.comparison.detection import bounces
 from scanner.comparison.judging import FIGURES, Row, distances
 from scanner.comparison.picture import reach_of
 from scanner.comparison.windows import Window
+from scanner.methods import METHODS
 from scanner.report.figures import Scale, outline, picture, shrink
 from scanner.report.oblique import Viewpoint
 from scanner.report.plates import window_around
@@ -26,9 +27,11 @@ from scanner.result import ScanResult
 _COLUMNS = (
     ("coverage", "Coverage", "share"),
     ("std_mm", "Std, mm", "length"),
+    ("std_ratio", "÷ no bounces", "ratio"),
     ("median_mm", "Median, mm", "length"),
     ("rmse_mm", "RMSE, mm", "length"),
     ("wrong_fringes", "Wrong fringe", "share"),
+    ("close", "&lt; 0.1 px", "share"),
     ("precision", "Precision", "share"),
     ("recall", "Recall", "share"),
     ("auc", "AUC", "figure"),
@@ -45,8 +48,6 @@ class Comparison:
     ----------
     title, facts
         Heading, and lines below it, such as bench and seeds.
-    command
-        What makes all of it again.
     methods
         Titles of the methods by name.
     results
@@ -55,17 +56,19 @@ class Comparison:
         Where was judged, and the figures over all scans.
     truth, least_alpha
         As `scanner.comparison.judge` had them.
+    key
+        Tells the figures of several comparisons on one page apart.
     """
 
     title: str
     facts: Mapping[str, str]
-    command: str
     methods: Mapping[str, str]
     results: Mapping[str, ScanResult]
     windows: Sequence[Window]
     rows: Sequence[Row]
     truth: SceneTruth | None
     least_alpha: float
+    key: str = ""
 
     @property
     def simulated(self) -> bool:
@@ -73,45 +76,81 @@ class Comparison:
         return any(r.simulated for r in self.results.values())
 
 
-def render(c: Comparison) -> str:
-    """Write the page; it loads nothing from anywhere."""
-    sections = (
-        _header(c),
+def render(c: Comparison, command: str) -> str:
+    """Write the page; it loads nothing from anywhere. ``command`` makes all of it again."""
+    return page(c.title, header(c.title, c.facts, command, c.simulated), *sections(c), simulated=c.simulated)
+
+
+def page(title: str, *parts: str, simulated: bool) -> str:
+    """Make one self-contained HTML page of its parts."""
+    here = files("scanner.report")
+    style, script = ((here / name).read_text("utf-8") for name in ("report.css", "viewer.js"))
+    stamp = '<div class="stamp" role="note">SIMULATED DATA</div>' if simulated else ""
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}{' (simulated)' if simulated else ''}</title><style>{style}</style></head>"
+        f"<body>{stamp}<main>{''.join(parts)}</main><script>{script}</script></body></html>\n"
+    )
+
+
+def sections(c: Comparison) -> list[str]:
+    """Tables and figures, without a heading of their own."""
+    return [
         *(_table(c, w) for w in c.windows),
+        _scene(c),
         _detection(c),
         _surfaces(c),
         *(_errors(c, w) for w in c.windows),
         _notes(c),
-    )
-    here = files("scanner.report")
-    style, script = ((here / name).read_text("utf-8") for name in ("report.css", "viewer.js"))
-    stamp = '<div class="stamp" role="note">SIMULATED DATA</div>' if c.simulated else ""
+    ]
+
+
+def header(title: str, facts: Mapping[str, str], command: str, simulated: bool) -> str:
+    """Heading of a page, with facts and the command that makes it again."""
+    listed = "".join(f"<div><dt>{k}</dt><dd>{escape(v)}</dd></div>" for k, v in facts.items() if v)
+    stamp = '<p class="simulated">SIMULATED DATA<small>no light was involved</small></p>' if simulated else ""
     return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(c.title)}{' (simulated)' if c.simulated else ''}</title><style>{style}</style></head>"
-        f"<body>{stamp}<main>{''.join(sections)}</main><script>{script}</script></body></html>\n"
+        f"<header><div><h1>{escape(title)}</h1><dl>{listed}</dl>"
+        f'<p class="command"><code>{escape(command)}</code></p></div>{stamp}</header>'
     )
 
 
-def _header(c: Comparison) -> str:
-    listed = "".join(f"<div><dt>{k}</dt><dd>{escape(v)}</dd></div>" for k, v in c.facts.items() if v)
-    simulated = '<p class="simulated">SIMULATED DATA<small>no light was involved</small></p>' if c.simulated else ""
-    return (
-        f"<header><div><h1>{escape(c.title)}</h1><dl>{listed}</dl>"
-        f'<p class="command"><code>{escape(c.command)}</code></p></div>{simulated}</header>'
-    )
+def _scene(c: Comparison) -> str:
+    """Draw what the camera sees, with the windows outlined."""
+    result = next(iter(c.results.values()))
+    drawn = np.logical_or.reduce([w.mask for w in c.windows])
+    bright = result.maps.brightness
+    figures = [
+        _map(
+            f"{c.key}scene",
+            "The scene",
+            bright,
+            Scale("gray", 0.0, float(np.nanpercentile(bright, 99.5)), "DN"),
+            "Mean of the fringes as the camera sees them. Outlined: where errors are judged.",
+            drawn,
+        ),
+        _map(
+            f"{c.key}modulation",
+            "Modulation of the captured fringes",
+            result.maps.modulation,
+            Scale.of(result.maps.modulation, "viridis", "DN"),
+            "Where two paths meet, their fringes add and cancel in turn.",
+        ),
+    ]
+    return grid("What is scanned", figures)
 
 
 def _table(c: Comparison, window: Window) -> str:
     rows = [r for r in c.rows if r.window == window.name]
     shown = [column for column in _COLUMNS if any(math.isfinite(r.mean[column[0]]) for r in rows)]
-    best = min((r.mean["std_mm"] for r in rows if r.mean["coverage"] > 0.5), default=math.nan)
+    named = [r for r in rows if r.method in METHODS and r.mean["coverage"] > 0.5]
+    best = min((r.mean["std_mm"] for r in named), default=math.nan)
     body = []
     for row in rows:
         cells = [f"<b>{escape(row.method)}</b><small>{escape(c.methods.get(row.method, ''))}</small>"]
         cells += [_cell(row.mean[key], row.half_width[key], kind) for key, _, kind in shown]
-        body.append(("best" if row.mean["std_mm"] == best else "", cells))
+        body.append(("best" if row in named and row.mean["std_mm"] == best else "", cells))
     head = ("Method", *(f'<span title="{escape(FIGURES[key])}">{label}</span>' for key, label, _ in shown))
     seeds = max((r.seeds for r in rows), default=1)
     said = f"Means over {seeds} seeds; ± is half the 95 % confidence interval. " if seeds > 1 else ""
@@ -120,7 +159,7 @@ def _table(c: Comparison, window: Window) -> str:
         f'<p class="caption">{said}Window of {number(int(window.mask.sum()))} px, {window.fit} fitted to the points of '
         f"each method; marked: the smallest std with more than half of the window covered. {explained}</p>"
     )
-    inside = f'<div class="wide">{table("figures-" + _key(window), head, body)}</div>{caption}'
+    inside = f'<div class="wide">{table(f"figures-{c.key}{_key(window.name)}", head, body)}</div>{caption}'
     return section(f"Figures · {escape(window.name)}", inside)
 
 
@@ -141,8 +180,8 @@ def _cell(mean: float, half: float, kind: str) -> str:
     return text
 
 
-def _key(window: Window) -> str:
-    return "".join(ch if ch.isalnum() else "-" for ch in window.name)
+def _key(name: str) -> str:
+    return "".join(ch if ch.isalnum() else "-" for ch in name)
 
 
 def _detection(c: Comparison) -> str:
@@ -153,7 +192,7 @@ def _detection(c: Comparison) -> str:
         alpha = np.where(np.isfinite(c.truth.x_p), np.nan_to_num(c.truth.alpha, nan=0.0), np.nan)
         figures.append(
             _map(
-                "truth",
+                f"{c.key}truth",
                 "Truth: share α of bounced light",
                 alpha,
                 Scale("magma", 0.0, min(1.0, float(np.nanpercentile(alpha, 99.5))), "α"),
@@ -164,10 +203,10 @@ def _detection(c: Comparison) -> str:
         )
     for name, result in c.results.items():
         maps = result.maps
-        if maps.score is not None:
+        if maps.score is not None and name in METHODS:
             figures.append(
                 _map(
-                    f"detected-{name}",
+                    f"{c.key}detected-{_key(name)}",
                     f"{escape(name)}: detected region",
                     maps.score,
                     Scale.of(np.maximum(maps.score, 1e-2), "gray", "statistic, logarithmic", logarithmic=True),
@@ -180,7 +219,7 @@ def _detection(c: Comparison) -> str:
             pattern = maps.regional_pattern.astype(np.float32)
             figures.append(
                 _map(
-                    f"regional-{name}",
+                    f"{c.key}regional-{_key(name)}",
                     f"{escape(name)}: regional pattern as captured",
                     pattern,
                     Scale("gray", 0.0, max(float(np.percentile(pattern, 99.8)), 1.0), "DN"),
@@ -209,7 +248,7 @@ def _surfaces(c: Comparison) -> str:
         what = "What is really there." if name == "truth" and c.truth is not None else _points_said(points)
         source = Scale("gray", -0.1, 1.0).png(shade)
         drawn = picture(source, view.size, f"{name}: surface seen from the right and above")
-        figures.append(figure(f"surface-{name}", escape(name), drawn, what))
+        figures.append(figure(f"{c.key}surface-{_key(name)}", escape(name), drawn, what))
     return grid("Surfaces from one viewpoint", figures)
 
 
@@ -229,7 +268,7 @@ def _errors(c: Comparison, window: Window) -> str:
         std = f"std {found.std():.3g} mm, " if found.size else ""
         figures.append(
             _map(
-                f"error-{_key(window)}-{row.method}",
+                f"{c.key}error-{_key(window.name)}-{_key(row.method)}",
                 escape(row.method),
                 off[cut] * factor,
                 Scale("RdBu_r", -reach * factor, reach * factor, unit),

@@ -1,4 +1,4 @@
-"""Where methods are compared: rectangles of the picture that the configuration names, or the detected region."""
+"""Where methods are compared: rectangles of the picture, places that the bench knows, or the detected region."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.config import CompareSection, ConfigError
+from drivers import SceneTruth
+from scanner.comparison.detection import bounces
+from scanner.config import CompareSection, ConfigError, WindowSection
 from scanner.result import Maps
 
 
@@ -33,7 +35,7 @@ class Window:
     mask: NDArray[np.bool_]
 
 
-def windows_of(section: CompareSection, maps: Iterable[Maps]) -> list[Window]:
+def windows_of(section: CompareSection, maps: Iterable[Maps], truth: SceneTruth | None = None) -> list[Window]:
     """Windows of the configuration; without any, the largest connected region that the first able method detected.
 
     Parameters
@@ -42,31 +44,67 @@ def windows_of(section: CompareSection, maps: Iterable[Maps]) -> list[Window]:
         Of the configuration.
     maps
         Of the methods in their order, one at least.
+    truth
+        Knows the places that windows name; None where the bench cannot tell.
 
     Raises
     ------
     ConfigError
-        A window reaches beyond the picture.
+        A window reaches beyond the picture, or its place is not known.
     """
     first, *others = maps
-    height, width = first.flags.shape
-    found = []
-    for window in section.windows:
-        if window.x + window.width > width or window.y + window.height > height:
-            raise ConfigError(
-                f"compare.windows: {window.name} reaches to ({window.x + window.width}, {window.y + window.height}), "
-                f"the camera's picture to ({width}, {height}) px",
-                "move the window, or make it smaller",
-            )
-        mask = np.zeros((height, width), bool)
-        mask[window.y : window.y + window.height, window.x : window.x + window.width] = True
-        found.append(Window(window.name, window.fit, mask))
+    found = [
+        Window(
+            window.name,
+            window.fit,
+            _rectangle(window, first.flags.shape)
+            if window.place is None
+            else _place(window, window.place, truth, section.least_alpha),
+        )
+        for window in section.windows
+    ]
     if found:
         return found
     detected = next((m.interreflection for m in (first, *others) if m.interreflection.any()), None)
     if detected is None:
         return [Window("whole picture", section.fit, first.valid)]
     return [Window("bounce region", section.fit, largest_region(detected))]
+
+
+def _rectangle(window: WindowSection, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    x, y, width, height = (side or 0 for side in (window.x, window.y, window.width, window.height))
+    if x + width > shape[1] or y + height > shape[0]:
+        raise ConfigError(
+            f"compare.windows: {window.name} reaches to ({x + width}, {y + height}), "
+            f"the camera's picture to ({shape[1]}, {shape[0]}) px",
+            "move the window, or make it smaller",
+        )
+    mask = np.zeros(shape, bool)
+    mask[y : y + height, x : x + width] = True
+    return mask
+
+
+def _place(window: WindowSection, place: str, truth: SceneTruth | None, least_alpha: float) -> NDArray[np.bool_]:
+    """Pixels of a place that have direct light and do not mix surfaces."""
+    if truth is None:
+        raise ConfigError(
+            f"compare.windows: {window.name} is a place of the scene, which this bench does not know",
+            "give a rectangle: x, y, width and height",
+        )
+    places = truth.places
+    if place not in places:
+        raise ConfigError(
+            f"compare.windows: {window.name} is at {place}, which this scene does not have",
+            f"name one of {', '.join(places)}",
+        )
+    bounce, _ = bounces(truth, least_alpha)
+    mask = places[place] & (bounce if window.bounced else np.isfinite(truth.x_p) & ~truth.edge)
+    if not mask.any():
+        raise ConfigError(
+            f"compare.windows: {window.name} has no pixel: {place} is not seen, not lit, or sees no bounce",
+            "choose another place, or a finer camera",
+        )
+    return mask
 
 
 def largest_region(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

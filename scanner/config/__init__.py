@@ -18,6 +18,7 @@ from scanner.config.models import (
     OutputSection,
     PeriodsByAxis,
     ScanSection,
+    WindowSection,
     check_plan_covers,
 )
 from scanner.config.problems import ConfigError, Problem
@@ -38,6 +39,7 @@ __all__ = [
     "PeriodsByAxis",
     "Problem",
     "ScanSection",
+    "WindowSection",
     "bench_kinds",
     "check_plan_covers",
     "json_schema",

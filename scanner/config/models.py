@@ -13,6 +13,7 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    JsonValue,
     PrivateAttr,
     SerializeAsAny,
     Tag,
@@ -305,14 +306,35 @@ class ScanSection(_Section):
 
 
 class WindowSection(_Section):
-    """A rectangle of the camera's picture with one surface in it."""
+    """A part of the camera's picture with one surface in it: a rectangle, or a place that the bench knows by name."""
 
     name: str = Field(min_length=1, description="Name in tables and figures, such as W1.")
-    x: int = Field(ge=0, description="Leftmost column, camera px.")
-    y: int = Field(ge=0, description="Topmost row, camera px.")
-    width: int = Field(ge=2, description="Columns.")
-    height: int = Field(ge=2, description="Rows.")
+    x: int | None = Field(None, ge=0, description="Leftmost column, camera px.")
+    y: int | None = Field(None, ge=0, description="Topmost row, camera px.")
+    width: int | None = Field(None, ge=2, description="Columns.")
+    height: int | None = Field(None, ge=2, description="Rows.")
+    place: str | None = Field(
+        None,
+        description="In place of the rectangle, where the bench knows the truth: a part of the scene, or a window of "
+        "its own, such as board or W1.",
+    )
+    bounced: bool = Field(
+        False, description="Of the place, the pixels alone that see a bounce of least_alpha beside their direct light."
+    )
     fit: Literal["plane", "sphere"] = Field("plane", description="What is fitted to the points in it.")
+
+    @model_validator(mode="after")
+    def _is_one_of_both(self) -> Self:
+        sides = {"x": self.x, "y": self.y, "width": self.width, "height": self.height}
+        given = [name for name, side in sides.items() if side is not None]
+        if self.place is not None and given:
+            what = f"found place and {', '.join(given)}, expected a place or a rectangle"
+            _refuse([_refusal((), what, "remove one of the two")])
+        if self.place is None and (len(given) < len(sides) or self.bounced):
+            missing = ", ".join(name for name in sides if name not in given) or "place"
+            remedy = "write x, y, width and height of a rectangle, or a place, which may be bounced"
+            _refuse([_refusal((), f"{missing} is missing", remedy)])
+        return self
 
 
 class CompareSection(_Section):
@@ -330,6 +352,11 @@ class CompareSection(_Section):
         description="Where the points are judged after a fit; none: the largest region that a method detected.",
     )
     fit: Literal["plane", "sphere"] = Field("plane", description="What is fitted where no window is given.")
+    reference: dict[str, JsonValue] = Field(
+        {},
+        description="Values that take the bounces away, such as {bench.scene.blackened: [mirror]}: with them the first "
+        "method scans once more, and the errors of all are compared with those of that row. {}: no such row.",
+    )
     least_alpha: float = Field(
         0.02,
         gt=0,

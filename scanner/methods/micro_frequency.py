@@ -8,6 +8,7 @@ separation where it is clear.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -53,6 +54,9 @@ _HALO_PX = 2
 
 _CLEARANCE_PX = 2
 """Fringes this near to the end of the lit set are cut by the projector's blur."""
+
+_CLEARANCE_PITCHES = 2.0
+"""And those within so many camera pixels of it by the camera's."""
 
 
 def frequencies(extent: int) -> tuple[float, ...]:
@@ -267,7 +271,7 @@ def _lit_here(
 ) -> NDArray[np.bool_]:
     """Whether a coordinate of round two lies where it was lit and its fringes were whole."""
     if x is not None and y is not None:
-        return inside(lit, x, y, _CLEARANCE_PX)
+        return inside(lit, x, y, max(_CLEARANCE_PX, math.ceil(_CLEARANCE_PITCHES * pitch(x, y))))
     if x is not None:
         columns = np.asarray(lit.any(axis=0))
         return inside(np.repeat(columns[None], lit.shape[0], axis=0), x, np.zeros_like(x), _CLEARANCE_PX)

@@ -147,8 +147,8 @@ def pairs_study(
     """
     rows: list[dict[str, Any]] = []
     examples: dict[tuple[float, float], tuple[IdealScene, dict[str, Judgement]]] = {}
-    for alpha, sigma in pairs:
-        report(f"α = {alpha:g}, σ = {sigma:g} DN")
+    for number, (alpha, sigma) in enumerate(pairs, 1):
+        report(f"pair {number} of {len(pairs)}: α = {alpha:g}, σ = {sigma:g} DN")
         scores: dict[str, list[Score]] = {d: [] for d in DETECTORS}
         for seed in seeds:
             rng = np.random.default_rng([seed, round(1000 * alpha), round(sigma)])
@@ -175,8 +175,8 @@ def distance_study(
 ) -> list[dict[str, Any]]:
     """One Δu at a time, blind values included: a disc whose bounce has this Δu everywhere."""
     rows = []
-    for delta in deltas_px:
-        report(f"Δu = {delta:g} px")
+    for number, delta in enumerate(deltas_px, 1):
+        report(f"distance {number} of {len(deltas_px)}: Δu = {delta:g} px at α = {alpha:g}, σ = {sigma_dn:g} DN")
         scores: dict[str, list[Score]] = {d: [] for d in DETECTORS}
         for seed in seeds:
             rng = np.random.default_rng([seed, round(10 * delta), round(1000 * alpha), round(sigma_dn)])
@@ -202,8 +202,8 @@ def clean_study(
     """Pictures without any bounce: the share of pixels beyond the threshold, and the share taken for a region."""
     beyond: dict[tuple[str, float], list[float]] = {}
     region: dict[tuple[str, float], list[float]] = {}
-    for seed in seeds:
-        report(f"clean picture {seed}")
+    for number, seed in enumerate(seeds, 1):
+        report(f"clean picture {number} of {len(seeds)}")
         rng = np.random.default_rng([seed, 77])
         scene = curved_scene(shape, 0.0, rng, axes)
         seen = observe(scene, dict.fromkeys(axes, PAPER_FREQUENCIES), PAPER_STEPS, sigma_dn, rng)

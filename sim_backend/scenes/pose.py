@@ -73,6 +73,14 @@ class Pose(BaseModel):
     def parts(self) -> Mapping[str, Sequence[Surface]]:
         """What there is by name, in the camera frame, before anything is blackened."""
 
+    def part_surfaces(self) -> Mapping[str, tuple[int, ...]]:
+        """Numbers of the surfaces of every part, in the order of `surfaces`."""
+        numbers, first = {}, 0
+        for name, some in self.parts().items():
+            numbers[name] = tuple(range(first, first + len(some)))
+            first += len(some)
+        return numbers
+
     def surfaces(self) -> list[Surface]:
         """What there is, in the camera frame and in the order of `parts`; blackened parts are black."""
         return [

@@ -67,7 +67,11 @@ def test_distances_from_a_plane_are_positive_towards_the_camera():
 def truth(alpha):
     columns = np.broadcast_to(np.arange(SHAPE[1], dtype=np.float32), SHAPE)
     points = np.stack([*np.meshgrid(*map(np.arange, SHAPE[::-1])), np.full(SHAPE, 500)], axis=-1).astype(np.float32)
-    return SimpleNamespace(x_p=columns, y_p=columns, points=points, alpha=alpha, edge=np.zeros(SHAPE, bool))
+    nan = np.full(SHAPE, np.nan, np.float32)
+    edge = np.zeros(SHAPE, bool)
+    return SimpleNamespace(
+        x_p=columns, y_p=columns, points=points, alpha=alpha, edge=edge, bounce_x=nan, bounce_y=nan, places={}
+    )
 
 
 def test_figures_of_a_window_are_those_of_the_errors_that_were_made():

@@ -1,5 +1,8 @@
 """Parts from mesh files: read right, placed right, and refused with a reason."""
 
+import math
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -7,12 +10,15 @@ from pydantic import ValidationError
 from drivers.errors import OperatorError
 from scanner.config import ConfigError, load_config
 from sim_backend.bench import truth_of
+from sim_backend.bracket import bracket, write
 from sim_backend.cache import transport_of
 from sim_backend.mesh_files import MeshFileError, read_mesh
 from sim_backend.scenes import PartScene, scene_of
 from sim_backend.settings import SimulatedSettings
-from sim_backend.solids import box
+from sim_backend.solids import box, prism
 from sim_backend.twins import twins_of
+
+CONFIGS = Path(__file__).parents[2] / "configs"
 
 TINY = {
     "camera": {"width_px": 96, "height_px": 72},
@@ -213,3 +219,24 @@ def test_a_part_that_lights_itself_has_a_twin_that_does_not(tmp_path):
     assert (truth.alpha[seen] > 0.05).mean() > 0.2
     assert dark.alpha[seen].max() == 0
     np.testing.assert_array_equal(truth.x_p[seen], dark.x_p[seen])
+
+
+def test_a_prism_has_the_volume_of_its_profile_and_faces_outwards():
+    vertices, triangles = prism([(0, 0), (4, 0), (4, 3), (1, 3), (0, 1)], -2, 5)
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    # The shoelace formula by hand: a rectangle 4 × 3 without the triangle (0, 1), (1, 3), (0, 3).
+    assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6 == pytest.approx(7 * (12 - 1))
+
+
+def test_the_bracket_is_what_its_file_holds(tmp_path):
+    write(tmp_path / "again.stl")
+    assert (tmp_path / "again.stl").read_bytes() == (CONFIGS / "scenes" / "meshes" / "bracket.stl").read_bytes()
+    vertices, triangles = bracket()
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    # A regular polygon of n sides and radius r has the area n r²/2 sin(2π/n).
+    boss = 48 * math.sin(2 * math.pi / 96) * (17**2 * 30 - 9**2 * 26)
+    gussets = 2 * 8 * (40.2 * 37.2 - 34 * 32 / 2)
+    # A square less the quarter disc of 24 sides, and two slivers that reach 0.2 mm into plate and wall.
+    fillet = 110 * (8 * 8 - 24 * 32 * math.sin(math.pi / 48) + 2 * 8 * 0.2 / 2)
+    volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+    assert volume == pytest.approx(110 * (70 * 9 + 9 * 62) + boss + gussets + fillet)
