@@ -23,7 +23,7 @@ _CONTINUOUS_PX = 3.0
 """On one surface the step to the next camera pixel exceeds twice the usual one by no more than this, projector px."""
 
 _RARE = 0.25
-"""An emitter throws at least this share of the bounces that an emitter's pixel usually throws."""
+"""A place throws at least this share of the bounces that come from where most do, or none."""
 
 _DENSITY = 3
 """A projector pixel is believed when at least this many coordinates fall on it and its 8 neighbours."""
@@ -94,7 +94,7 @@ def emitter_mask(
     counts = _splat(x, y, size)
     side = 2 * gap + 1
     near = cv2.blur(counts.astype(np.float32), (side, side))
-    usual = float(np.median(near[counts > 0])) if counts.any() else 0.0
+    usual = float(np.median(np.repeat(near.ravel(), counts.ravel()))) if counts.any() else 0.0
     source = _close(_believed(counts, gap) & (near >= _RARE * usual), gap)
     return np.asarray(cv2.dilate(source.astype(np.uint8), _disc(int(np.ceil(reach_px)))) > 0)
 
