@@ -54,7 +54,7 @@ def scan(bench, folder, **options):
 def both(tmp_path_factory):
     folder = tmp_path_factory.mktemp("faces")
     bench = two_faces(seed=11)
-    return bench, scan(bench, folder, steps=12), folder
+    return bench, scan(bench, folder), folder
 
 
 def test_faces_that_light_each_other_take_turns(both):
@@ -92,7 +92,7 @@ def test_the_recording_of_several_sequences_processes_to_the_same(both):
     again = process_take(Take.open(folder / "take"), job.scan, GatesSection(), None)
     for name in ("x_p", "y_p", "sequence", "flags"):
         np.testing.assert_array_equal(getattr(again.maps, name), getattr(job.decoder.maps, name))
-    assert list(again.summary["frames"].values()) == [216, 216, 216]
+    assert list(again.summary["frames"].values()) == [108, 108, 108]
     assert "2 regional sequences" in again.summary["rounds"]
 
 
@@ -146,3 +146,26 @@ def test_progress_counts_the_sequences_that_are_planned(tmp_path):
     assert {p.rounds for p in seen if p.round == 2} == {3}
     last = seen[-1]
     assert (last.round, last.done) == (last.rounds, last.total)
+
+
+def test_where_a_bounce_is_too_weak_to_be_detected_it_is_gone_as_well(scan_simulated):
+    # The paper's second experiment, small, in a pose of its own: weak bounces cover the board, below detection at W2.
+    scene = {"name": "v_board_sphere", "distance_mm": 655.0, "opening_deg": 114.0, "yaw_deg": 2.0}
+    settings = {
+        "seed": 23,
+        "camera": {"width_px": 256, "height_px": 192},
+        "projector": {"width_px": 640, "height_px": 400},
+        "transport": {"photons": 200_000},
+    }
+    maps, truth = scan_simulated(scene, **settings)
+    without, _ = scan_simulated({**scene, "blackened": ["ball"]}, options={"rounds": 1}, **settings)
+    window = truth.in_window("W2")
+    assert not maps.interreflection[window].all()
+    assert np.isfinite(maps.depth[window]).mean() >= 0.98
+    # Between the 16 and 84 % points: a few pixels beside the ball's limb, lit with it, keep an error of their own.
+    spread, twin = (
+        np.subtract(*np.nanquantile((m.depth - truth.depth)[window], (0.84, 0.16))) for m in (maps, without)
+    )
+    assert spread <= 1.15 * twin
+    alone = np.abs(maps.x_p_round1 - truth.x_p)[window]
+    assert np.nanmedian(alone) > 2 * np.nanmedian(np.abs(maps.x_p - truth.x_p)[window])
