@@ -1,7 +1,7 @@
-"""The state machine that runs a method on a bench: one round or two, every sequence checked, everything journalled.
+"""The state machine that runs a method on a bench: all rounds, every sequence checked, everything journalled.
 
     IDLE → PREFLIGHT → CAPTURING ⇄ REPEATING
-                          ↓  ↑ (round two)
+                          ↓  ↑ (regional rounds)
                         DECODING → COMPLETED          any state → CANCELLED | FAILED
 
 While one sequence is photographed, a second thread checks, commits and demodulates the one before it. A sequence that
@@ -167,7 +167,7 @@ class Acquisition:
     _exposure: int = field(default=0, init=False)
 
     def run(self) -> Maps:
-        """Both rounds; returns the fused maps.
+        """All rounds; returns the fused maps.
 
         Raises
         ------
@@ -190,15 +190,19 @@ class Acquisition:
                 first, noise = self._round(1, first_plan, first_plan.frame_count, levels)
                 self._enter(ScanState.DECODING, "decoding round 1")
                 with self._timed("decode round 1"):
-                    second_plan = self.decoder.first(first, noise)
-                if self.decoder.decision:
-                    self.listener.note(self.decoder.decision)
-                    self.take.note(self.decoder.decision)
-                if second_plan is not None:
-                    second, noise = self._round(2, second_plan, first_plan.frame_count + second_plan.frame_count, None)
-                    self._enter(ScanState.DECODING, "decoding round 2")
-                    with self._timed("decode round 2"):
-                        self.decoder.second(second, noise)
+                    regional = self.decoder.first(first, noise)
+                self._tell_decision("")
+                number, before = 1, first_plan.frame_count
+                while regional is not None:
+                    number += 1
+                    to_come = (self.decoder.rounds - number + 1) * regional.frame_count
+                    frames, noise = self._round(number, regional, before + to_come, None)
+                    before += regional.frame_count
+                    self._enter(ScanState.DECODING, f"decoding round {number}")
+                    told = self.decoder.decision
+                    with self._timed(f"decode round {number}"):
+                        regional = self.decoder.regional(frames, noise)
+                    self._tell_decision(told)
             self._enter(ScanState.COMPLETED, "done")
             return self.decoder.maps
         except KeyboardInterrupt:
@@ -208,10 +212,16 @@ class Acquisition:
             self._enter(ScanState.FAILED, "failed")
             raise
 
+    def _tell_decision(self, told: str) -> None:
+        """Say what was decided about further rounds, unless that was ``told`` before."""
+        if self.decoder.decision != told:
+            self.listener.note(self.decoder.decision)
+            self.take.note(self.decoder.decision)
+
     @property
     def _rounds(self) -> int:
-        """Rounds at most."""
-        return self.scan.rounds_at_most(self.method.rounds)
+        """Rounds, as far as is known."""
+        return max(self.scan.rounds_at_most(self.method.rounds), self.decoder.rounds)
 
     @property
     def _passes(self) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers import NoiseModel
 from scanner.config import ScanSection
-from scanner.methods import FirstRound, Method, RoundFrames, Setup
+from scanner.methods import FirstRound, Method, RepeatedlyRegional, RoundFrames, Setup
 from scanner.patterns import Plan
 from scanner.result import Flag, Maps
 from scanner.rig import Rig
@@ -60,8 +60,10 @@ class Decoder:
         self.decision = self._first.decision
         return self.method.second_round(self._first, self._setup)
 
-    def second(self, frames: RoundFrames, noise: NoiseModel | None = None) -> None:
-        """Join round two; with sequences missing, only what round one could tell alone is kept.
+    def regional(self, frames: RoundFrames, noise: NoiseModel | None = None) -> Plan | None:
+        """Join a regional round; returns the plan of the next, or None where there is nothing more to do.
+
+        With sequences missing, only what the rounds before could tell is kept.
 
         Parameters
         ----------
@@ -73,20 +75,39 @@ class Decoder:
         if self._first is None or self._setup is None:
             raise AssertionError("round two is decoded after round one")
         if len(frames.added) < len(frames.plan.sequences):
-            self.give_up_second(frames.plan)
-        else:
-            setup = self._setup if noise is None else replace(self._setup, noise=noise)
+            self.give_up_regional(frames.plan)
+            return None
+        setup = self._setup if noise is None else replace(self._setup, noise=noise)
+        if not isinstance(self.method, RepeatedlyRegional):
             self._maps = self.method.fuse(self._first, frames, setup)
+            return None
+        self._first = self.method.join(self._first, frames, setup)
+        self._maps = self._first.maps
+        self.warnings += self._first.notes
+        self.decision = self._first.decision
+        return self.method.second_round(self._first, self._setup)
 
-    def give_up_second(self, plan: Plan) -> None:
-        """Say of the pixels that only round two could have told that the recording ended before it."""
+    @property
+    def rounds(self) -> int:
+        """Rounds in all, as far as is known after the last that was decoded."""
+        return 1 if self._first is None else 1 + self._first.regional
+
+    def give_up_regional(self, plan: Plan) -> None:
+        """Say of the pixels that only this regional round could have told that the recording ended before it."""
         maps = self.maps
         flags = maps.flags.copy()
         flags[maps.interreflection & ~maps.valid] |= np.uint16(Flag.INCOMPLETE)
-        self._maps = replace(maps, flags=flags, lit=plan.mask)
-        self.warnings.append(
-            "round two is not complete: the bounce region holds what round one could separate, and nothing else"
-        )
+        if maps.lit is None:
+            self._maps = replace(maps, flags=flags, lit=plan.mask)
+            self.warnings.append(
+                "round two is not complete: the bounce region holds what round one could separate, and nothing else"
+            )
+        else:
+            self._maps = replace(maps, flags=flags)
+            self.warnings.append(
+                "the regional rounds are not complete: the rest of the bounce region holds what round one could "
+                "separate, and nothing else"
+            )
 
     @property
     def maps(self) -> Maps:

@@ -29,6 +29,18 @@ _SMALLEST_REGION = 12
 MOST_EVIDENCE = 3 * BOUNDARY_PRICE
 """A single pixel never says more than its own boundary costs: no region stands on one pixel."""
 
+_MOST_UNEVEN = 1.5
+"""The better quarter of clean pixels fits worse than the best fiftieth by less than this; more is bounces."""
+
+_QUIET = 0.02
+"""Share of the pixels that see no bounce in any scene."""
+
+_PENUMBRA_PX = 15
+"""Window whose mean statistic tells bounces below the threshold of a pixel, camera px."""
+
+_PENUMBRA_EXCESS, _PENUMBRA_SIGMAS, _PENUMBRA_LEAST = 0.1, 5.0, 30
+"""By how much it exceeds what the quietest pixels show: relative, and in its own noise; and of how many pixels."""
+
 _EDGE_REACH = 3
 """How far from a depth edge, px, the optics mix both surfaces."""
 
@@ -53,6 +65,9 @@ class Detection:
         Value of ``statistic`` that the chosen share of clean pixels exceeds.
     excess_noise
         Variance of clean pixels over what the noise model says; the threshold is scaled with it.
+    penumbra
+        bool, pixels outside all of these that only together with their neighbours show a bounce: its rim, where it is
+        too weak to be detected and still moves a coordinate by more than its noise.
     """
 
     region: NDArray[np.bool_]
@@ -61,6 +76,7 @@ class Detection:
     statistic: NDArray[np.float32]
     threshold: float
     excess_noise: float
+    penumbra: NDArray[np.bool_]
 
 
 def modulation_variation(phasors: AxisPhasors, gain: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -122,7 +138,7 @@ def detect(
     itself suspect (exceeds the 5 % point) and most neighbours exceed the threshold: weak bounces are joined up, single
     false alarms dropped, and a clean pixel beside a strong bounce stays clean.
     """
-    excess = max(1.0, excess_misfit(statistic, dof, usable))
+    excess = excess_noise(statistic, dof, usable)
     threshold = float(chi2_distribution.isf(false_alarm_rate, dof)) * excess
     suspect_from = float(chi2_distribution.isf(0.05, dof)) * excess
     strong = usable & (statistic > threshold)
@@ -161,14 +177,14 @@ def detect_pooled(
     of the pixels outside the region that was found with it does not.
     """
     spectra = Spectra.of(residuals, usable)
-    excess = max(1.0, excess_misfit(statistic, dof, usable))
+    excess = excess_noise(statistic, dof, usable)
     found, start = np.zeros(usable.shape, bool), None
     for _ in range(2):
         pooled = pool(residuals, statistic, dof, usable, false_alarm_rate, excess, spectra)
         evidence = np.clip(pooled.evidence, -MOST_EVIDENCE, MOST_EVIDENCE)
         start = label(evidence, start=start)
         found = usable & (start > 0.5)
-        before, excess = excess, max(1.0, excess_misfit(statistic, dof, usable & ~found))
+        before, excess = excess, excess_noise(statistic, dof, usable & ~found)
         if excess > 0.99 * before:
             break
     threshold = float(chi2_distribution.isf(false_alarm_rate, dof)) * excess
@@ -188,14 +204,41 @@ def _sorted_out(
     edge = _depth_edges(found, usable, coordinates)
     region = _without_small(_fill_pinholes(found & ~edge, usable), _SMALLEST_REGION)
     certain = float(chi2_distribution.isf(1e-6, dof)) * excess
+    suspicious = usable & (statistic > certain) & ~region & ~edge
     return Detection(
         region=region,
         depth_edge=edge & ~region,
-        suspicious=usable & (statistic > certain) & ~region & ~edge,
+        suspicious=suspicious,
         statistic=statistic / np.float32(dof),
         threshold=threshold / dof,
         excess_noise=excess,
+        penumbra=_penumbra(statistic, dof, usable, usable & ~found & ~region & ~edge & ~suspicious),
     )
+
+
+def _penumbra(
+    statistic: NDArray[np.float32], dof: int, usable: NDArray[np.bool_], asked: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Those of the ``asked`` pixels whose mean statistic over the asked ones around exceeds what quiet ones show."""
+    window = (_PENUMBRA_PX, _PENUMBRA_PX)
+    near, total = (
+        cv2.boxFilter(plane, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for plane in (asked.astype(np.float32), np.where(asked, statistic, np.float32(0)))
+    )
+    quiet = max(1.0, _relative_quantile(statistic, dof, usable, _QUIET))
+    near = np.maximum(near, 1)
+    limit = quiet * (1 + _PENUMBRA_EXCESS + _PENUMBRA_SIGMAS * np.sqrt(2 / (dof * near)))
+    return np.asarray(asked & (near >= _PENUMBRA_LEAST) & (total > dof * near * limit))
+
+
+def excess_noise(statistic: NDArray[np.float32], dof: int, usable: NDArray[np.bool_]) -> float:
+    """Variance of clean pixels in units of what the noise model says, 1 at least.
+
+    The lower quartile of the statistic tells it until bounces cover three quarters of the picture; from there on the
+    quietest pixels do.
+    """
+    quiet = _relative_quantile(statistic, dof, usable, _QUIET)
+    return max(1.0, min(excess_misfit(statistic, dof, usable), _MOST_UNEVEN * quiet))
 
 
 def excess_misfit(statistic: NDArray[np.float32], dof: int, usable: NDArray[np.bool_]) -> float:
@@ -203,11 +246,15 @@ def excess_misfit(statistic: NDArray[np.float32], dof: int, usable: NDArray[np.b
 
     The lower quartile stays with the clean pixels even where bounces cover most of the picture.
     """
+    return _relative_quantile(statistic, dof, usable, 0.25)
+
+
+def _relative_quantile(statistic: NDArray[np.float32], dof: int, usable: NDArray[np.bool_], share: float) -> float:
     values = statistic[usable]
     if values.size < 100:
         return 1.0
-    quartile = np.quantile(values[:: max(1, values.size // 200_000)], 0.25)
-    return float(quartile) / float(chi2_distribution.ppf(0.25, dof))
+    quantile = np.quantile(values[:: max(1, values.size // 200_000)], share)
+    return float(quantile) / float(chi2_distribution.ppf(share, dof))
 
 
 def _count_neighbours(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -54,15 +54,15 @@ def process_take(
     planned = decoder.first(first, noise)
     timings["decode round 1"] = time.perf_counter() - began
     frames = {"round 1": sum(len(s.frames) for s in take.sequences(1).values())}
-    if 2 in take.rounds and scan.rounds != 1:
+    for number in sorted(take.rounds)[1:] if scan.rounds != 1 else []:
         began = time.perf_counter()
-        second, noise, _ = _collect(take, 2, method, decoder, warnings, report)
-        report("decoding round 2")
-        decoder.second(second, noise)
-        timings["decode round 2"] = time.perf_counter() - began
-        frames["round 2"] = sum(len(s.frames) for s in take.sequences(2).values())
-    elif planned is not None:
-        decoder.give_up_second(replace(planned, mask=None))
+        again, noise, _ = _collect(take, number, method, decoder, warnings, report)
+        report(f"decoding round {number}")
+        planned = decoder.regional(again, noise)
+        timings[f"decode round {number}"] = time.perf_counter() - began
+        frames[f"round {number}"] = sum(len(s.frames) for s in take.sequences(number).values())
+    if planned is not None and (take.status != "completed" or 2 not in take.rounds):
+        decoder.give_up_regional(replace(planned, mask=None))
     assert decoder.used_noise is not None
     return summarise(
         method.name,

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_CELL_PX = 8
+CELL_PX = 8
 """Side of the cells in which it is counted who lights whom, projector px."""
 
-_HARM = 0.02
+HARM = 0.02
 """A surface that lights more than this share of another's pixels must not be lit together with it."""
 
-_SMALLEST_SURFACE = 12
+LEAST_SURFACE = 12
 """Fewer pixels than this are strays of the separation, not a surface."""
 
 _CONTINUOUS_PX = 3.0
@@ -24,6 +24,9 @@ _CONTINUOUS_PX = 3.0
 
 _REACH_PITCHES = 2.5
 """The lit set is grown by so many camera pixels at least: one sees half its own width and three σ of the blur."""
+
+_RARE = 0.25
+"""A place throws at least this share of the bounces that come from where most do, or none."""
 
 _DENSITY = 3
 """A projector pixel is believed when at least this many coordinates fall on it and its 8 neighbours."""
@@ -69,6 +72,69 @@ def sound_mask(
     return np.asarray(grown)
 
 
+def emitter_mask(
+    x: NDArray[np.float32], y: NDArray[np.float32], size: tuple[int, int], reach_px: float, pitch_px: float = 1.0
+) -> NDArray[np.bool_]:
+    """Where most bounces come from.
+
+    Parameters
+    ----------
+    x, y
+        (P,) coordinates of the bounces, px.
+    size
+        Projector (width, height), px.
+    reach_px
+        By how much the emitters are grown, px.
+    pitch_px
+        As `sound_mask`.
+
+    Returns
+    -------
+    NDArray
+        (height, width) bool. Places with few bounces for their kind are none: there the fringe order of a bounce is
+        wrong more often than a bounce.
+    """
+    gap = max(1, int(np.ceil(pitch_px)))
+    counts = _splat(x, y, size)
+    side = 2 * gap + 1
+    near = cv2.blur(counts.astype(np.float32), (side, side))
+    usual = float(np.median(np.repeat(near.ravel(), counts.ravel()))) if counts.any() else 0.0
+    source = _close(_believed(counts, gap) & (near >= _RARE * usual), gap)
+    return np.asarray(cv2.dilate(source.astype(np.uint8), _disc(int(np.ceil(reach_px)))) > 0)
+
+
+def between_paths(
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    bounce_x: NDArray[np.float32],
+    bounce_y: NDArray[np.float32],
+    size: tuple[int, int],
+    reach_px: float,
+) -> NDArray[np.bool_]:
+    """Projector pixels between a direct place and the emitter of its bounce, where these are near to each other.
+
+    Towards a fold both paths meet, and before they do they are too close for round one to see that there are two.
+
+    Parameters
+    ----------
+    x, y, bounce_x, bounce_y
+        (P,) direct coordinates and those of the bounces, px.
+    size
+        Projector (width, height), px.
+    reach_px
+        Paths farther apart than this tell nothing.
+
+    Returns
+    -------
+    NDArray
+        (height, width) bool.
+    """
+    near = np.hypot(bounce_x - x, bounce_y - y) <= reach_px
+    way = np.linspace(0, 1, int(np.ceil(reach_px)) + 1, dtype=np.float32)[:, None]
+    along = [(u[near] + way * (v[near] - u[near])).ravel() for u, v in ((x, bounce_x), (y, bounce_y))]
+    return _close(_believed(_splat(along[0], along[1], size), 1), 1)
+
+
 def pitch(x: NDArray[np.float32], y: NDArray[np.float32]) -> float:
     """Usual distance (px) of the coordinates (H, W) that neighbouring camera pixels see; 1 where it cannot be told."""
     steps = [np.abs(np.diff(u, axis=axis)) for u in (x, y) for axis in (0, 1)]
@@ -100,18 +166,12 @@ def lit_together(
     NDArray
         (H, W) bool, pixels of the chosen surfaces.
     """
-    limit = _CONTINUOUS_PX + 2 * pitch(x, y)
-    broken = ~(np.isfinite(x) & np.isfinite(y))
-    for axis in (0, 1):
-        step = np.abs(np.diff(x, axis=axis)) + np.abs(np.diff(y, axis=axis))
-        jump = step > limit
-        broken[(slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))] |= jump
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((~broken).astype(np.uint8), connectivity=4)
+    count, labels, stats = surfaces(x, y)
     by_size = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")
     chosen = np.zeros(count, bool)
     lit: set[int] = set()
     emitting: dict[int, float] = {}
-    for label in by_size[stats[by_size, cv2.CC_STAT_AREA] >= _SMALLEST_SURFACE]:
+    for label in by_size[stats[by_size, cv2.CC_STAT_AREA] >= LEAST_SURFACE]:
         left, top, width, height, area = stats[label]
         window = (slice(top, top + height), slice(left, left + width))
         mine = labels[window] == label
@@ -119,7 +179,7 @@ def lit_together(
         sources, counts = np.unique(_cells(bounce_x[window][mine], bounce_y[window][mine]), return_counts=True)
         harmed = sum(n for cell, n in zip(sources.tolist(), counts.tolist(), strict=True) if cell in lit)
         harming = sum(emitting.get(cell, 0.0) for cell in places)
-        if harmed > _HARM * area or harming > _HARM:
+        if harmed > HARM * area or harming > HARM:
             continue
         chosen[label] = True
         lit |= places
@@ -128,11 +188,31 @@ def lit_together(
     return np.asarray(chosen[labels])
 
 
+def on_surface(x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(H, W) pixels whose coordinates (H, W) continue those of enough neighbours; the others are strays."""
+    _, labels, stats = surfaces(x, y)
+    enough = stats[:, cv2.CC_STAT_AREA] >= LEAST_SURFACE
+    enough[0] = False
+    return np.asarray(enough[labels])
+
+
+def surfaces(x: NDArray[np.float32], y: NDArray[np.float32]) -> tuple[int, NDArray[np.int32], NDArray[np.int32]]:
+    """Connected surfaces: their number, (H, W) labels, and OpenCV's statistics; 0 is none."""
+    limit = _CONTINUOUS_PX + 2 * pitch(x, y)
+    broken = ~(np.isfinite(x) & np.isfinite(y))
+    for axis in (0, 1):
+        step = np.abs(np.diff(x, axis=axis)) + np.abs(np.diff(y, axis=axis))
+        jump = step > limit
+        broken[(slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))] |= jump
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((~broken).astype(np.uint8), connectivity=4)
+    return count, np.asarray(labels, np.int32), np.asarray(stats, np.int32)
+
+
 def _cells(x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.int64]:
     """Number of the cell that each coordinate lies in, -1 for NaN."""
     cells = np.full(x.shape, -1, np.int64)
     known = np.isfinite(x) & np.isfinite(y)
-    row, column = (np.floor(u[known] / _CELL_PX).astype(np.int64) for u in (y, x))
+    row, column = (np.floor(u[known] / CELL_PX).astype(np.int64) for u in (y, x))
     cells[known] = row * 100_000 + column
     return cells
 

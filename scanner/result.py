@@ -79,7 +79,11 @@ class Maps:
     x_p_round1, y_p_round1, misfit_round2
         Coordinates of round one and misfit of round two; None for methods of one round.
     lit
-        (projector height, projector width) bool, what round two lit.
+        (projector height, projector width) bool, what any regional sequence lit.
+    lit_by
+        (projector height, projector width) uint8, bit k - 1 set where regional sequence k lit.
+    sequence
+        uint8, the regional sequence that measured the pixel, 0 for none.
     regional_pattern
         uint8 or uint16 frame of round two, for the report.
     """
@@ -104,6 +108,8 @@ class Maps:
     y_p_round1: NDArray[np.float32] | None = None
     misfit_round2: NDArray[np.float32] | None = None
     lit: NDArray[np.bool_] | None = None
+    lit_by: NDArray[np.uint8] | None = None
+    sequence: NDArray[np.uint8] | None = None
     regional_pattern: Pixels | None = None
     score: NDArray[np.float32] | None = None
 

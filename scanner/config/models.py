@@ -231,6 +231,13 @@ class ScanSection(_Section):
         description="Rounds of mfs. 2: a second round follows wherever a bounce was detected; auto: only where the "
         "separation of both light paths from round one alone does not suffice; 1: never. The other methods have one.",
     )
+    max_regional_sequences: int = Field(
+        4,
+        ge=1,
+        le=8,
+        description="How many regional sequences mfs may take after round one: places that light each other need one "
+        "each, and what still sees a bounce is lit once more by itself. 1: one, for the largest part.",
+    )
     lit_margin_px: float = Field(
         6, ge=0, le=200, description="By how much the region that round two lights is grown, projector px."
     )

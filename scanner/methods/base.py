@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +81,8 @@ class FirstRound:
         Warnings for the operator.
     decision
         Whether a second round follows and why, in words; empty where there was nothing to decide.
+    regional
+        Regional sequences that were taken or are planned; 1 where the method does not say.
     """
 
     maps: Maps
@@ -88,6 +90,7 @@ class FirstRound:
     private: object = None
     notes: list[str] = field(default_factory=list)
     decision: str = ""
+    regional: int = 1
 
 
 class Method(Protocol):
@@ -126,6 +129,18 @@ class Method(Protocol):
 
     def fuse(self, first: FirstRound, second: RoundFrames, setup: Setup) -> Maps:
         """Join both rounds."""
+        ...
+
+
+@runtime_checkable
+class RepeatedlyRegional(Protocol):
+    """A method that may light the region more than once: each sequence is joined, and may bring about the next."""
+
+    def join(self, first: FirstRound, regional: RoundFrames, setup: Setup) -> FirstRound:
+        """Join a regional sequence to what is known; `Method.second_round` of the result is the next, if any.
+
+        ``notes`` of the result are those that the sequence adds.
+        """
         ...
 
 

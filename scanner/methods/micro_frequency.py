@@ -8,7 +8,6 @@ separation where it is clear.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -22,6 +21,7 @@ from scanner.interreflection import (
     Detection,
     detect,
     detect_pooled,
+    excess_noise,
     misfit_statistic,
     modulation_variation,
     variation_statistic,
@@ -35,12 +35,13 @@ from scanner.methods.base import (
     stepped_plan,
 )
 from scanner.methods.multi_frequency import DecodedAxis, decode_axes, one_path_maps
+from scanner.methods.regional import AXES, WORTH, Regional, again, begin, lit_here, plane, remaining
 from scanner.methods.separated import Separated, phasors_of, separate_region
 from scanner.methods.sufficiency import Evidence, weigh
 from scanner.patterns import Axis, Plan
 from scanner.phasors import RoundPhasors
 from scanner.pooling import one_path_residuals
-from scanner.regions import continued, inside, lit_together, literal_mask, pitch, sound_mask
+from scanner.regions import literal_mask
 from scanner.result import Flag, Maps
 
 FREQUENCIES = 9
@@ -52,11 +53,11 @@ _REFUSED_ONE_IN = 1e4
 _HALO_PX = 2
 """Round two also serves the pixels this near to the region, whose bounce is below detection."""
 
-_CLEARANCE_PX = 2
-"""Fringes this near to the end of the lit set are cut by the projector's blur."""
+_SAME_PLACE_PX = 4.0
+"""A coordinate as near as this to another is of the same place: a quarter of a fringe."""
 
-_CLEARANCE_PITCHES = 2.0
-"""And those within so many camera pixels of it by the camera's."""
+_DIRECT_SHARE = 0.5
+"""Least modulation of a place that round one did not expect, in units of round one's: less is a bounce."""
 
 
 def frequencies(extent: int) -> tuple[float, ...]:
@@ -70,7 +71,7 @@ class _Private:
     decoded: dict[Axis, DecodedAxis]
     detection: Detection
     separated: Separated
-    evidence: Evidence
+    regional: Regional
 
 
 @dataclass(frozen=True)
@@ -144,98 +145,184 @@ class MicroFrequencyShifting:
             score=detection.statistic,
         )
         evidence = weigh(separated, frames.plan.size)
+        regional = self._begun(first, separated, detection, evidence, frames.plan, setup.scan)
         return FirstRound(
             refuse_off_epipolar(first, setup.rig),
             frames.plan,
-            _Private(decoded, detection, separated, evidence),
+            _Private(decoded, detection, separated, regional),
+            regional=max(regional.planned, 1),
             decision=evidence.decision(setup.scan.rounds, frames.plan.frame_count) if separated.pixels.size else "",
         )
 
     def second_round(self, first: FirstRound, setup: Setup) -> Plan | None:
-        """The same fringes, lit only where the scan's rule says; None where there is no bounce or one round does."""
+        """The same fringes, lit only where the next regional sequence lights; None where there is none."""
         assert isinstance(first.private, _Private)
-        if not first.private.detection.region.any() or first.private.evidence.one_round(setup.scan.rounds):
+        if not first.private.regional.queue:
             return None
-        size = first.plan.size
-        if setup.scan.regional_rule == "literal":
-            undetected = ~first.private.detection.region
-            x, y = first.maps.x_p_round1, first.maps.y_p_round1
-            shape = undetected.sum()
-            nothing = np.full(shape, np.nan, np.float32)
-            mask = literal_mask(nothing if x is None else x[undetected], nothing if y is None else y[undetected], size)
-        else:
-            mask = self._sound(first.private, size, setup.scan.lit_margin_px)
-        if not mask.any():
-            return None
-        return replace(first.plan, mask=mask)
+        return replace(first.plan, mask=first.private.regional.queue[0])
 
-    @staticmethod
-    def _sound(private: _Private, size: tuple[int, int], margin_px: float) -> NDArray[np.bool_]:
-        """Light the surfaces of the region that do not light each other, and what lies between their pixels."""
-        s = private.separated
-        nothing = np.full(s.shape, np.nan, np.float32)
-        x, y, bounce_x, bounce_y = (
-            _plane(s, values[a]) if a in values else nothing for values in (s.u, s.bounce) for a in ("x", "y")
-        )
-        chosen = _plane(s, np.ones(s.pixels.size, np.float32)) == 1
-        if len(s.u) == 2:
-            chosen &= lit_together(x, y, bounce_x, bounce_y)
-        # Where the fringe orders of both paths could not be told, the surface around them can.
-        between = private.detection.region & ~chosen
-        direct = [
-            np.append(u[chosen], continued(u, chosen, between) if a in s.u else nothing[between])
-            for a, u in (("x", x), ("y", y))
-        ]
-        emitters = bounce_x[chosen], bounce_y[chosen]
-        return sound_mask(direct[0], direct[1], size, margin_px, emitters, pitch(x, y))
+    def _begun(
+        self, maps: Maps, separated: Separated, detection: Detection, evidence: Evidence, plan: Plan, scan: ScanSection
+    ) -> Regional:
+        """What the regional sequences are to light."""
+        region = detection.region
+        if self.rounds == 1 or scan.rounds == 1 or not region.any():
+            return Regional.nothing(region.shape, plan.size)
+        most = scan.max_regional_sequences if scan.regional_rule == "sound" else 1
+        begun = begin(separated, detection, maps, plan.size, scan.lit_margin_px, most)
+        if evidence.one_round(scan.rounds):
+            return replace(begun, queue=())
+        if scan.regional_rule == "literal":
+            undetected = ~region
+            nothing = np.full(int(undetected.sum()), np.nan, np.float32)
+            x, y = (nothing if u is None else u[undetected] for u in (maps.x_p_round1, maps.y_p_round1))
+            mask = literal_mask(x, y, plan.size)
+            return replace(begun, queue=(mask,) if mask.any() else ())
+        return begun
 
     def fuse(self, first: FirstRound, second: RoundFrames, setup: Setup) -> Maps:
-        """Inside the region round two where it passes, else the separated paths where clear; outside, round one.
+        """Join a regional sequence; see `join`."""
+        return self.join(first, second, setup).maps
 
-        Round two goes first even where the separation predicts the smaller σ: it removed the bounce, the separation has
-        to assume how many there are, and where both paths nearly coincide its σ says little.
+    def join(self, first: FirstRound, regional: RoundFrames, setup: Setup) -> FirstRound:
+        """Inside the region a regional sequence where it passes, else the separated paths where clear.
+
+        A regional sequence goes first even where the separation predicts the smaller σ: it removed the bounce, the
+        separation has to assume how many there are, and where both paths nearly coincide its σ says little.
+
+        Of several sequences that show the same place that counts which was meant for it, or fits best; of several
+        places the brighter, since a pixel that is dark itself may still see its bounce.
         """
         assert isinstance(first.private, _Private)
-        assert isinstance(second, RoundPhasors)
-        private, lit = first.private, second.plan.mask
+        assert isinstance(regional, RoundPhasors)
+        private, lit = first.private, regional.plan.mask
         assert lit is not None
-        decoded = decode_axes(second, setup, {a: d.gain for a, d in private.decoded.items()})
+        state = private.regional
+        state = replace(
+            state,
+            queue=state.queue[1:],
+            taken=state.taken + 1,
+            lit=state.lit | np.where(lit, np.uint8(1 << min(state.taken, 7)), np.uint8(0)),
+        )
+        decoded = decode_axes(regional, setup, {a: d.gain for a, d in private.decoded.items()})
         if set(decoded) != set(private.decoded):
-            return replace(first.maps, lit=lit)
-        coordinates = [d.coordinates for d in decoded.values()]
-        total, dof = misfit_statistic(coordinates)
-        maps2, usable = one_path_maps(second, decoded, setup)
+            return replace(first, maps=replace(first.maps, lit=state.lit > 0), private=replace(private, regional=state))
+        total, dof = misfit_statistic([d.coordinates for d in decoded.values()])
+        found, usable = one_path_maps(regional, decoded, setup)
+        only = state.planned == 1
+        if not only:
+            found = refuse_off_epipolar(found, setup.rig)
         region = private.detection.region
-        target = _dilated(region, _HALO_PX) & ~private.detection.depth_edge
-        limit = chi2_distribution.isf(1 / _REFUSED_ONE_IN, dof) * private.detection.excess_noise
-        x2, y2 = maps2.x_p, maps2.y_p
-        lit_here = _lit_here(lit, x2, y2)
+        own = state.own == state.taken
+        target = (_dilated(region, _HALO_PX) & ~private.detection.depth_edge) | (state.served & own)
+        here = lit_here(lit, found.x_p, found.y_p)
+        # Where bounces cover the picture, round one overrates the noise; a sequence without them does not.
+        excess = min(private.detection.excess_noise, excess_noise(total, dof, target & usable & here))
+        limit = chi2_distribution.isf(1 / _REFUSED_ONE_IN, dof) * excess
         fits = total < np.float32(limit)
-        passed = target & usable & fits & lit_here & maps2.valid
+        misfit = total / np.float32(dof)
+        passed = target & usable & fits & here & found.valid
+        if not only:
+            passed &= _near(found, state.x, state.y) | (found.modulation >= _DIRECT_SHARE * first.maps.modulation)
+        before = state.sequence > 0
+        same = _near(found, first.maps.x_p, first.maps.y_p)
+        rather = own | state.doubted | ((state.sequence != state.own) & (misfit < state.misfit))
+        better = np.where(same, rather, found.modulation > state.modulation)
+        passed &= ~before | better
+        state = replace(
+            state,
+            sequence=np.where(passed, np.uint8(state.taken), state.sequence),
+            modulation=np.where(passed, found.modulation, state.modulation),
+            misfit=np.where(passed, misfit, state.misfit),
+        )
         flags = first.maps.flags.copy()
-        flags[region & usable & ~lit_here & maps2.valid] |= np.uint16(Flag.NOT_LIT)
-        flags[region & second.saturated] |= np.uint16(Flag.SATURATED)
+        flags[region & usable & ~here & found.valid & (state.sequence == 0)] |= np.uint16(Flag.NOT_LIT)
+        flags[region & regional.saturated] |= np.uint16(Flag.SATURATED)
+        flags[passed] |= np.uint16(Flag.SECOND_ROUND)
+        flags[passed] &= ~np.uint16(
+            Flag.SEPARATED | Flag.MISFIT | Flag.NOT_LIT | Flag.OFF_EPIPOLAR | Flag.OUT_OF_VOLUME
+        )
         one = first.maps
 
         def merged(old: NDArray[np.float32] | None, new: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
             return None if old is None or new is None else np.where(passed, new, old)
 
-        flags[passed] |= np.uint16(Flag.SECOND_ROUND)
-        flags[passed] &= ~np.uint16(
-            Flag.SEPARATED | Flag.MISFIT | Flag.NOT_LIT | Flag.OFF_EPIPOLAR | Flag.OUT_OF_VOLUME
-        )
+        tested = target & usable & (passed | (state.sequence == 0))
+        old = np.float32(np.nan) if one.misfit_round2 is None else one.misfit_round2
         fused = replace(
             one,
             flags=flags,
-            misfit_round2=np.where(target & usable, total / np.float32(dof), np.float32(np.nan)),
-            lit=lit,
-            regional_pattern=second.example,
-            x_p=merged(one.x_p, maps2.x_p),
-            y_p=merged(one.y_p, maps2.y_p),
-            sigma_x=merged(one.sigma_x, maps2.sigma_x),
-            sigma_y=merged(one.sigma_y, maps2.sigma_y),
+            misfit_round2=np.where(tested, misfit, old),
+            lit=state.lit > 0,
+            lit_by=state.lit,
+            sequence=state.sequence,
+            regional_pattern=regional.example if one.regional_pattern is None else one.regional_pattern,
+            x_p=merged(one.x_p, found.x_p),
+            y_p=merged(one.y_p, found.y_p),
+            sigma_x=merged(one.sigma_x, found.sigma_x),
+            sigma_y=merged(one.sigma_y, found.sigma_y),
         )
-        return refuse_off_epipolar(fused, setup.rig)
+        if state.taken + len(state.queue) < state.most and len(decoded) == 2:
+            state = self._learned(regional, decoded, passed, target & usable & here, private.detection, state, setup)
+            if not state.queue:
+                state = again(state, region, private.separated, first.plan.size, setup.scan.lit_margin_px)
+        joined = replace(
+            first,
+            maps=refuse_off_epipolar(fused, setup.rig),
+            private=replace(private, regional=state),
+            regional=max(state.planned, 1),
+            notes=[],
+        )
+        return _concluded(joined, first.decision, region, state)
+
+    @staticmethod
+    def _learned(
+        regional: RoundPhasors,
+        decoded: dict[Axis, DecodedAxis],
+        passed: NDArray[np.bool_],
+        asked: NDArray[np.bool_],
+        detection: Detection,
+        state: Regional,
+        setup: Setup,
+    ) -> Regional:
+        """Detect again what a regional sequence shows, and keep where direct light and bounce come from there."""
+        coordinates = [d.coordinates for d in decoded.values()]
+        total, dof = misfit_statistic(coordinates)
+        still = detect(total, dof, coordinates, asked, setup.scan.false_alarm_rate)
+        if still.region.sum() <= WORTH * detection.region.sum():
+            return state
+        found = separate_region(regional, decoded, still, passed & ~still.region, setup)
+        paths = np.stack([plane(found, values[a]) for values in (found.u, found.bounce) for a in AXES])
+        return replace(
+            state,
+            failed=np.where(np.isfinite(paths[:1]), paths, state.failed),
+            doubted=(state.doubted & ~passed) | (still.region & (passed | (state.sequence == 0))),
+        )
+
+
+def _near(maps: Maps, x: NDArray[np.float32] | None, y: NDArray[np.float32] | None) -> NDArray[np.bool_]:
+    """Whether the coordinates lie where others are, (H, W); False where either is unknown."""
+    near = np.ones(maps.flags.shape, bool)
+    for u, v in ((maps.x_p, x), (maps.y_p, y)):
+        if u is not None and v is not None:
+            near &= np.abs(u - v) <= _SAME_PLACE_PX
+    return near
+
+
+def _concluded(first: FirstRound, said: str, region: NDArray[np.bool_], state: Regional) -> FirstRound:
+    """Say after the last sequence how many there were, and what they have left."""
+    if state.queue:
+        return first
+    rest = int(remaining(state, region).sum())
+    share = rest / max(int(region.sum()), 1)
+    told = f"{state.taken} regional sequences: places of the bounce region light each other" if state.taken > 1 else ""
+    notes = []
+    if share > WORTH:
+        notes.append(
+            f"{100 * share:.1f} % of the bounce region's pixels still see a bounce after {state.taken} regional "
+            f"sequence{'s' * (state.taken > 1)}, or could not be lit: they hold what round one separates, or nothing"
+        )
+    return replace(first, decision="; ".join(t for t in (said, told) if t), notes=notes)
 
 
 def _detect_pooled(
@@ -254,27 +341,6 @@ def _put(plane: NDArray[np.float32], separated: Separated, values: NDArray[np.fl
     plane.reshape(-1)[separated.pixels[separated.trusted]] = values[separated.trusted]
 
 
-def _plane(separated: Separated, values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) values of the plausible pixels, NaN elsewhere."""
-    plane = np.full(separated.shape, np.nan, np.float32)
-    plane.reshape(-1)[separated.pixels[separated.plausible]] = values[separated.plausible]
-    return plane
-
-
 def _dilated(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     return np.asarray(cv2.dilate(mask.astype(np.uint8), disc) > 0)
-
-
-def _lit_here(
-    lit: NDArray[np.bool_], x: NDArray[np.float32] | None, y: NDArray[np.float32] | None
-) -> NDArray[np.bool_]:
-    """Whether a coordinate of round two lies where it was lit and its fringes were whole."""
-    if x is not None and y is not None:
-        return inside(lit, x, y, max(_CLEARANCE_PX, math.ceil(_CLEARANCE_PITCHES * pitch(x, y))))
-    if x is not None:
-        columns = np.asarray(lit.any(axis=0))
-        return inside(np.repeat(columns[None], lit.shape[0], axis=0), x, np.zeros_like(x), _CLEARANCE_PX)
-    assert y is not None
-    rows = np.asarray(lit.any(axis=1))
-    return inside(np.repeat(rows[:, None], lit.shape[1], axis=1), np.zeros_like(y), y, _CLEARANCE_PX)

@@ -40,6 +40,9 @@ _CLEAR_CHOICE = 2.0
 _CLEAR_PLACE = float(np.log(100))
 """With a rig its place must be a hundred times as likely as the next."""
 
+_LOCATED_PX = 4.0
+"""Largest σ of a bounce's place that still says who lights whom, projector px."""
+
 
 @dataclass(frozen=True)
 class Separated:
@@ -61,6 +64,8 @@ class Separated:
         Whether neither one nor two paths fit.
     off_line
         Whether two paths fit and neither lies on the epipolar line: a mirror shows the pixel something else.
+    located
+        Whether the place that the bounce comes from is known as well: clear, and to a quarter of a fringe.
     blur
         Predicted σ in units of what the same amplitude reaches alone, on the axis that carries the depth.
     """
@@ -74,6 +79,7 @@ class Separated:
     trusted: NDArray[np.bool_]
     third: NDArray[np.bool_]
     off_line: NDArray[np.bool_]
+    located: NDArray[np.bool_]
     blur: NDArray[np.float32]
 
 
@@ -101,7 +107,7 @@ def separate_region(
         nan = np.full(pixels.size, np.nan, np.float32)
         no = np.zeros(pixels.size, bool)
         unknown = dict.fromkeys(axes, nan)
-        return Separated(detection.region.shape, pixels, unknown, unknown, unknown, no, no, no, no, nan)
+        return Separated(detection.region.shape, pixels, unknown, unknown, unknown, no, no, no, no, no, nan)
     said = {a: _said(frames, a, decoded[a], pixels, detection.excess_noise) for a in axes}
     if setup.rig is not None and len(axes) == 2:
         coupling = _coupling(setup.rig, decoded, clean)
@@ -146,6 +152,7 @@ def _together(
         plausible & (found.confidence > _CLEAR_PLACE),
         found.third,
         ~plausible & ~found.third,
+        plausible & (found.confidence > _CLEAR_PLACE) & (best.sigma_bounce < _LOCATED_PX).all(axis=0),
         np.asarray(blur[found.along], np.float32),
     )
 
@@ -169,8 +176,8 @@ def _apart(detection: Detection, pixels: NDArray[np.intp], said: dict[Axis, Axis
         plausible &= two.converged & fits
         clear &= two.margin > _CLEAR_ORDERS
         blur = np.fmax(blur, spread[axis] / _alone(said[axis], two.amplitude[pick, column]))
-    no = np.zeros(pixels.size, bool)
-    return Separated(detection.region.shape, pixels, u, spread, bounce, plausible, plausible & clear, third, no, blur)
+    no, trusted = np.zeros(pixels.size, bool), plausible & clear
+    return Separated(detection.region.shape, pixels, u, spread, bounce, plausible, trusted, third, no, trusted, blur)
 
 
 def _coupling(rig: Rig, decoded: dict[Axis, DecodedAxis], clean: NDArray[np.bool_]) -> Coupling:

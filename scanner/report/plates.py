@@ -106,11 +106,13 @@ def round_two(maps: Maps) -> str:
             )
         )
     if maps.lit is not None:
+        turns = 0 if maps.lit_by is None else int(maps.lit_by.max()).bit_length()
         lit = _Plate("lit", "Lit projector pixels", shrink(maps.lit.astype(np.uint8)), Scale("gray", 0, 1))
         figures.append(
             lit.figure(
-                f"Projector picture, not camera: round two lit {per_cent(float(maps.lit.mean()))} of it (white). Only "
-                "places whose direct light falls into the region should be lit.",
+                f"Projector picture, not camera: round two lit {per_cent(float(maps.lit.mean()))} of it (white)"
+                + (f" in {turns} sequences, since places of the region light each other" if turns > 1 else "")
+                + ". Only places whose direct light falls into the region should be lit.",
                 bar=False,
             )
         )

@@ -15,7 +15,7 @@ Layout of the folder, a contract with tools outside of this repository::
 of the line before ``,"record_xxh3"``. Checksums are XXH3, 64 bits, in hexadecimal. The other members, by ``kind``:
 
 =================== =========================================================================================
-round_begun         ``round`` (1, 2), ``plan``. Begun again with another plan, its former sequences are void.
+round_begun         ``round`` (from 1), ``plan``. Begun again with another plan, its former sequences are void.
 frame               ``round``, ``sequence``, ``attempt``, ``index`` (place in the sequence), ``slot``,
                     ``frame_id``, ``t_device_s``, ``t_host_s``, ``t_shown_s`` (null where unknown),
                     ``pixels_xxh3``

@@ -210,7 +210,7 @@ class TakeWriter:
         Parameters
         ----------
         round
-            1 or 2.
+            From 1; all after the first are regional.
         plan
             `scanner.patterns.Plan.to_json`. Another plan than before makes the round's former sequences void.
         """

@@ -87,6 +87,7 @@ def region_of(count=400, **changes):
         "trusted": yes,
         "third": no,
         "off_line": no,
+        "located": yes,
         "blur": np.ones(count, np.float32),
     }
     return Separated(**{**values, **changes})

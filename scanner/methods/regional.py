@@ -1,0 +1,313 @@
+"""What the regional sequences light, one after the other, and what each of them leaves to the next (method.md §5).
+
+Places of the region that light each other take turns (`scanner.groups`). Where a sequence still detects a bounce, its
+own phasors are separated, and what is left when all have been taken is divided and lit once more.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from scanner.groups import group_places
+from scanner.interreflection import Detection
+from scanner.methods.separated import Separated
+from scanner.patterns import Axis
+from scanner.regions import (
+    between_paths,
+    continued,
+    emitter_mask,
+    inside,
+    lit_together,
+    on_surface,
+    pitch,
+    sound_mask,
+    surfaces,
+)
+from scanner.result import Maps
+
+CLEARANCE_PX = 2
+"""Fringes this near to the end of the lit set are cut by the projector's blur."""
+
+_CLEARANCE_PITCHES = 2.0
+"""And those within so many camera pixels of it by the camera's."""
+
+CLOSE_PATHS_PX = 32.0
+"""Two fringes: between paths nearer than this others may meet unseen."""
+
+WORTH = 0.01
+"""Share of the region's pixels for which another sequence is taken."""
+
+_PROGRESS = 0.7
+"""Sequences for what is left follow only while they leave less than this share of what there was."""
+
+_AROUND_PX = 24.0
+"""Standard deviation of the window in which what round one does not tell follows most of what it does, camera px."""
+
+_EMITTER_PX = 3.0
+"""How far from an emitter undetected places are lit along."""
+
+
+@dataclass(frozen=True)
+class Regional:
+    """The regional sequences of a scan: what they have measured, and what they are still to light.
+
+    Parameters
+    ----------
+    queue
+        (height, width) bool each, what the next sequences light.
+    x, y
+        (H, W) where round one has the direct light of the served pixels come from, px; NaN where it does not tell.
+    own
+        (H, W) uint8, the sequence that is meant to measure the pixel, 0 for none.
+    served
+        (H, W) bool, undetected pixels whose coordinates the sequences may replace.
+    most
+        Sequences at most.
+    taken
+        Sequences so far.
+    lit
+        (height, width) uint8, bit k - 1 set where sequence k lit.
+    sequence
+        (H, W) uint8, the sequence that measured the pixel, 0 for none.
+    modulation, misfit
+        (H, W) what that sequence showed there, DN and χ² per degree of freedom; NaN where none did.
+    failed
+        (4, H, W) direct coordinates and those of the bounce where a sequence still detected one, px; NaN elsewhere.
+    doubted
+        (H, W) bool, where the sequence that measured a pixel, or all that lit it, still detects a bounce.
+    left
+        Pixels that were left over when sequences were last planned.
+    """
+
+    queue: tuple[NDArray[np.bool_], ...]
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    own: NDArray[np.uint8]
+    served: NDArray[np.bool_]
+    most: int
+    taken: int
+    lit: NDArray[np.uint8]
+    sequence: NDArray[np.uint8]
+    modulation: NDArray[np.float32]
+    misfit: NDArray[np.float32]
+    failed: NDArray[np.float32]
+    doubted: NDArray[np.bool_]
+    left: int
+
+    @classmethod
+    def nothing(cls, shape: tuple[int, ...], size: tuple[int, int]) -> Regional:
+        """No sequence, for a camera's (height, width) and a projector's (width, height)."""
+        unknown, no = np.full(shape, np.nan, np.float32), np.zeros(shape, bool)
+        return cls(
+            queue=(),
+            x=unknown,
+            y=unknown,
+            own=np.zeros(shape, np.uint8),
+            served=no,
+            most=0,
+            taken=0,
+            lit=np.zeros((size[1], size[0]), np.uint8),
+            sequence=np.zeros(shape, np.uint8),
+            modulation=unknown,
+            misfit=unknown,
+            failed=np.full((4, *shape), np.nan, np.float32),
+            doubted=no,
+            left=0,
+        )
+
+    @property
+    def planned(self) -> int:
+        """Sequences that were taken or will be, as far as is known."""
+        return self.taken + len(self.queue)
+
+
+def begin(
+    separated: Separated,
+    detection: Detection,
+    first: Maps,
+    size: tuple[int, int],
+    margin_px: float,
+    most: int,
+) -> Regional:
+    """Plan the regional sequences from round one.
+
+    Parameters
+    ----------
+    separated, detection, first
+        Round one: both paths in its region, and the coordinates outside.
+    size
+        Projector (width, height), px.
+    margin_px
+        By how much what is lit is grown.
+    most
+        Sequences at most.
+    """
+    shape = separated.shape
+    paths = np.stack([plane(separated, values.get(a)) for values in (separated.u, separated.bounce) for a in AXES])
+    known = plausible(separated)
+    located = plane(separated, separated.located.astype(np.float32)) == 1
+    nothing = np.full(shape, np.nan, np.float32)
+    one_x, one_y = (nothing if u is None else u for u in (first.x_p_round1, first.y_p_round1))
+    rim = detection.penumbra & first.valid
+    both = len(separated.u) == 2
+    if both:
+        x, y, from_x, from_y = (p[known] for p in paths)
+        blind = between_paths(x, y, from_x, from_y, size, CLOSE_PATHS_PX)
+        rim |= first.valid & ~detection.region & ~detection.depth_edge & inside(blind, one_x, one_y, 0)
+    group = np.where(known, np.int8(0), np.int8(-1))
+    if both and most > 1:
+        group[known] = -1
+        known = known & on_surface(paths[0], paths[1])
+        x, y = (p[known] for p in paths[:2])
+        from_x, from_y = (np.where(located, p, np.float32(np.nan))[known] for p in paths[2:])
+        group[known] = group_places(x, y, from_x, from_y, most)
+    if group.max() < 1 and both:
+        group = np.where(plausible(separated) & lit_together(*paths), np.int8(0), np.int8(-1))
+    between = detection.region & (group < 0)
+    x, y, group, masks = _masks(group, paths, located, between, rim, (one_x, one_y), separated, size, margin_px)
+    return replace(
+        Regional.nothing(shape, size),
+        queue=tuple(masks) if masks and masks[0].any() else (),
+        x=x,
+        y=y,
+        own=(group + 1).astype(np.uint8),
+        served=rim,
+        most=most,
+        left=int(detection.region.sum()),
+    )
+
+
+AXES: tuple[Axis, Axis] = ("x", "y")
+
+
+def _masks(
+    group: NDArray[np.int8],
+    paths: NDArray[np.float32],
+    located: NDArray[np.bool_],
+    between: NDArray[np.bool_],
+    rim: NDArray[np.bool_],
+    first: tuple[NDArray[np.float32], NDArray[np.float32]],
+    separated: Separated,
+    size: tuple[int, int],
+    margin_px: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int8], list[NDArray[np.bool_]]]:
+    """Direct places of all that is served, the group that serves each, and what every group lights."""
+    places = [np.where(group >= 0, p, np.float32(np.nan)) for p in paths[:2]]
+    for place, u in zip(places, first, strict=True):
+        place[rim] = u[rim]
+    if group.max(initial=-1) < 0:
+        return places[0], places[1], group, []
+    nearest = _around(group, [np.where(np.isfinite(p), p, u) for p, u in zip(places, first, strict=True)])
+    step = pitch(paths[0], paths[1])
+    masks = []
+    for k in range(int(group.max()) + 1):
+        chosen, mine = group == k, between & (nearest == k)
+        direct = []
+        for place, u, a in zip(places, paths[:2], AXES, strict=True):
+            # Where the fringe orders of both paths could not be told, the surface around them can.
+            found = continued(u, chosen, mine) if a in separated.u else u[mine]
+            place[mine] = found
+            direct.append(np.append(u[chosen], found))
+        emitters = paths[2][chosen], paths[3][chosen]
+        mask = sound_mask(direct[0], direct[1], size, margin_px, emitters, step)
+        around = rim & (nearest == k)
+        along = sound_mask(first[0][around], first[1][around], size, margin_px, None, step)
+        sources = paths[2][chosen & located], paths[3][chosen & located]
+        masks.append(mask | (along & ~emitter_mask(*sources, size, _EMITTER_PX, step)))
+    return places[0], places[1], np.where(np.isfinite(places[0]) | np.isfinite(places[1]), nearest, -1), masks
+
+
+def _around(group: NDArray[np.int8], places: list[NDArray[np.float32]]) -> NDArray[np.int8]:
+    """(H, W) group of every pixel: its own, else that of most pixels around it, on the same surface if there is any."""
+    count, labels, _ = surfaces(places[0], places[1])
+    votes = []
+    for k in range(int(group.max()) + 1):
+        mine = group == k
+        there = np.zeros(count, bool)
+        there[labels[mine]] = True
+        there[0] = False
+        near = cv2.GaussianBlur(mine.astype(np.float32), (0, 0), _AROUND_PX, borderType=cv2.BORDER_CONSTANT)
+        # Beyond the blur the nearest counts, a little.
+        votes.append(near + 1e-6 / (1 + distance_transform_edt(~mine)) + there[labels])
+    found = np.argmax(np.stack(votes), axis=0)
+    return np.where(group >= 0, group, found).astype(np.int8)
+
+
+def again(
+    regional: Regional, region: NDArray[np.bool_], separated: Separated, size: tuple[int, int], margin_px: float
+) -> Regional:
+    """Plan sequences for what all sequences so far have left, where that is worth it.
+
+    Parameters
+    ----------
+    regional
+        Its queue is empty.
+    region
+        (H, W) bool, the detected region.
+    separated
+        Of round one; for pixels that no sequence has lit.
+    size, margin_px
+        As `begin`.
+    """
+    rest = remaining(regional, region)
+    left = int(rest.sum())
+    budget = regional.most - regional.taken
+    if budget < 1 or left <= WORTH * region.sum() or left > _PROGRESS * regional.left:
+        return regional
+    once = np.stack([plane(separated, values.get(a)) for values in (separated.u, separated.bounce) for a in AXES])
+    paths = np.where(np.isfinite(regional.failed[:1]), regional.failed, once)
+    paths = np.where(rest, paths, np.float32(np.nan))
+    known = on_surface(paths[0], paths[1])
+    group = np.full(rest.shape, -1, np.int8)
+    x, y, from_x, from_y = (p[known] for p in paths)
+    group[known] = group_places(x, y, from_x, from_y, budget)
+    nothing = np.zeros_like(rest)
+    between, located = rest & (group < 0), np.isfinite(paths[2])
+    x, y, group, masks = _masks(
+        group, paths, located, between, nothing, (paths[0], paths[1]), separated, size, margin_px
+    )
+    new = np.isfinite(x)
+    return replace(
+        regional,
+        queue=tuple(masks) if masks and masks[0].any() else (),
+        x=np.where(new, x, regional.x),
+        y=np.where(new, y, regional.y),
+        own=np.where(group >= 0, group + 1 + regional.taken, regional.own).astype(np.uint8),
+        left=left,
+    )
+
+
+def remaining(regional: Regional, region: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(H, W) bool, pixels of the region with a known direct place that no sequence has measured without a bounce."""
+    return np.asarray(region & ((regional.sequence == 0) | regional.doubted) & np.isfinite(regional.x))
+
+
+def plane(separated: Separated, values: NDArray[np.float32] | None) -> NDArray[np.float32]:
+    """(H, W) values of the plausible pixels, NaN elsewhere."""
+    found = np.full(separated.shape, np.nan, np.float32)
+    if values is not None:
+        found.reshape(-1)[separated.pixels[separated.plausible]] = values[separated.plausible]
+    return found
+
+
+def plausible(separated: Separated) -> NDArray[np.bool_]:
+    """(H, W) bool, pixels with a separation that says where to light."""
+    return np.asarray(plane(separated, np.ones(separated.pixels.size, np.float32)) == 1)
+
+
+def lit_here(lit: NDArray[np.bool_], x: NDArray[np.float32] | None, y: NDArray[np.float32] | None) -> NDArray[np.bool_]:
+    """Whether a coordinate lies where a sequence lit and its fringes were whole."""
+    if x is not None and y is not None:
+        return inside(lit, x, y, max(CLEARANCE_PX, math.ceil(_CLEARANCE_PITCHES * pitch(x, y))))
+    if x is not None:
+        columns = np.asarray(lit.any(axis=0))
+        return inside(np.repeat(columns[None], lit.shape[0], axis=0), x, np.zeros_like(x), CLEARANCE_PX)
+    assert y is not None
+    rows = np.asarray(lit.any(axis=1))
+    return inside(np.repeat(rows[:, None], lit.shape[1], axis=1), np.zeros_like(y), y, CLEARANCE_PX)
