@@ -232,11 +232,12 @@ class ScanSection(_Section):
         "separation of both light paths from round one alone does not suffice; 1: never. The other methods have one.",
     )
     max_regional_sequences: int = Field(
-        4,
+        1,
         ge=1,
         le=8,
-        description="How many regional sequences mfs may take after round one: places that light each other need one "
-        "each, and what still sees a bounce is lit once more by itself. 1: one, for the largest part.",
+        description="How many regional sequences mfs may take after round one. 1: one, for the largest part; more: "
+        "places that light each other take turns, and what still sees a bounce is lit once more by itself. A mirror "
+        "in the picture counts as a place.",
     )
     lit_margin_px: float = Field(
         6, ge=0, le=200, description="By how much the region that round two lights is grown, projector px."

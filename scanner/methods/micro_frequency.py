@@ -321,6 +321,7 @@ def _concluded(first: FirstRound, said: str, region: NDArray[np.bool_], state: R
         notes.append(
             f"{100 * share:.1f} % of the bounce region's pixels still see a bounce after {state.taken} regional "
             f"sequence{'s' * (state.taken > 1)}, or could not be lit: they hold what round one separates, or nothing"
+            + ("; scan.max_regional_sequences allows more" if state.taken >= state.most else "")
         )
     return replace(first, decision="; ".join(t for t in (said, told) if t), notes=notes)
 

@@ -37,7 +37,7 @@ def two_faces(**changes):
 
 
 def scan(bench, folder, **options):
-    section = ScanSection(**({"steps": 6} | options))
+    section = ScanSection(**({"steps": 6, "max_regional_sequences": 4} | options))
     method = METHODS["mfs"]
     plan = method.first_round(section, bench.projector_size)
     manifest = {"method": "mfs", "bench": {}, "config": {}, "plans": [plan.to_json()], "simulated": True}
@@ -109,7 +109,7 @@ def test_a_recording_that_ends_within_a_regional_sequence_holds_those_before(tmp
         scan(bench, tmp_path, attempts=1)
     take = Take.open(tmp_path / "take")
     assert max(take.rounds) == lost_in
-    result = process_take(take, ScanSection(steps=6), GatesSection(), None)
+    result = process_take(take, ScanSection(steps=6, max_regional_sequences=4), GatesSection(), None)
     maps = result.maps
     assert any("not complete" in w for w in result.warnings)
     measured = (maps.flags & Flag.SECOND_ROUND) > 0
@@ -134,7 +134,7 @@ def test_progress_counts_the_sequences_that_are_planned(tmp_path):
             pass
 
     bench = two_faces(seed=14)
-    section, method = ScanSection(steps=6), METHODS["mfs"]
+    section, method = ScanSection(steps=6, max_regional_sequences=4), METHODS["mfs"]
     plan = method.first_round(section, bench.projector_size)
     manifest = {"method": "mfs", "bench": {}, "config": {}, "plans": [plan.to_json()], "simulated": True}
     with TakeWriter.create(
