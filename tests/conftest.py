@@ -25,9 +25,10 @@ def pytest_addoption(parser):
 
 HERE = Path(__file__).parent
 ALONE = (
-    "conformance", "drivers",
-    "scanner/test_cli_interrupted", "scanner/test_preview", "sim_backend/gentl",
-    "sim_backend/test_trigger_box", "sim_backend/test_world", "sim_backend/test_xserver", "test_virtual",
+    "conformance", "drivers/test_doctor", "drivers/test_genicam_faults", "drivers/test_genicam_traps",
+    "drivers/test_process", "drivers/test_trigger_box", "drivers/test_window", "scanner/test_cli_interrupted",
+    "scanner/test_preview", "sim_backend/gentl", "sim_backend/test_trigger_box", "sim_backend/test_world",
+    "sim_backend/test_xserver", "test_virtual",
 )  # fmt: skip
 """Where tests live on real time, windows or processes of their own: they have the machine to themselves."""
 
