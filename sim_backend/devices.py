@@ -267,6 +267,8 @@ class SimulatedCamera:
         return self.exposure_s
 
     def _expose_for(self, exposure_us: float) -> None:
+        if exposure_us == self._settings.exposure_us:
+            return
         self._settings = self._settings.model_copy(update={"exposure_us": exposure_us})
         self._optics = replace(self._optics, camera=self._settings)
 

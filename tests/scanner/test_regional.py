@@ -157,7 +157,7 @@ def test_where_a_bounce_is_too_weak_to_be_detected_it_is_gone_as_well(scan_simul
         "projector": {"width_px": 640, "height_px": 400},
         "transport": {"photons": 200_000},
     }
-    maps, truth = scan_simulated(scene, **settings)
+    maps, truth = scan_simulated(scene, options={"max_regional_sequences": 4}, **settings)
     without, _ = scan_simulated({**scene, "blackened": ["ball"]}, options={"rounds": 1}, **settings)
     window = truth.in_window("W2")
     assert not maps.interreflection[window].all()
