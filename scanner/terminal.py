@@ -55,6 +55,10 @@ def plan_table(chosen: DesignedPlan, usual: DesignedPlan, plans: Sequence[Design
     return table
 
 
+_LEFT_TO_THE_REPORT = ("<0.1px %", "med mm", "AUC", "s", "prec", "recall", "rmse mm")
+"""Columns of a comparison that a narrow terminal goes without, the first first."""
+
+
 class Terminal:
     """Listens to a scan and shows it.
 
@@ -205,21 +209,24 @@ class Terminal:
             mine = [row for row in rows if row.window == window]
             shown = {k: c for k, c in columns.items() if any(math.isfinite(row.mean[k]) for row in mine)}
             seeds = f", means of {mine[0].seeds} scans" if mine[0].seeds > 1 else ""
-            table = Table(
-                title=f"{window} after a fit{seeds}", title_justify="left", box=None, pad_edge=False, padding=(0, 1)
-            )
+            cells = {
+                name: [written.format(factor * row.mean[k]) if math.isfinite(row.mean[k]) else "–" for row in mine]
+                for k, (name, factor, written) in shown.items()
+            }
+            methods = [row.method.upper() for row in mine]
+
+            for name in _LEFT_TO_THE_REPORT:
+                if _width([methods, *cells.values()], ["method", *cells]) > self.console.width:
+                    cells.pop(name, None)
+            table = Table(title=f"{window} after a fit{seeds}", title_justify="left", box=None, pad_edge=False)
             table.add_column("method", no_wrap=True)
-            for name, _, _ in shown.values():
+            for name in cells:
                 table.add_column(name, justify="right", no_wrap=True)
-            for row in mine:
-                cells = [
-                    written.format(factor * row.mean[k]) if math.isfinite(row.mean[k]) else "–"
-                    for k, (_, factor, written) in shown.items()
-                ]
-                table.add_row(row.method.upper(), *cells)
+            for number, method in enumerate(methods):
+                table.add_row(method, *(column[number] for column in cells.values()))
             self.console.print()
             self.console.print(table)
-        self.console.print(f"report, with intervals and figures: {path / 'report.html'}", markup=False)
+        self.console.print(f"report, with all columns, intervals and figures: {path / 'report.html'}", markup=False)
 
     def paper(self, document: Mapping[str, Any], path: Path) -> None:
         """Print what the paper's experiments reach, and where the report is."""
@@ -262,3 +269,8 @@ class Terminal:
             self._bar.stop()
             self._bar = self._task = None
         sys.stdout.flush()
+
+
+def _width(columns: Sequence[Sequence[str]], heads: Sequence[str]) -> int:
+    """Characters of a table without a box."""
+    return sum(2 + max(map(len, [head, *cells])) for head, cells in zip(heads, columns, strict=True)) - 2
