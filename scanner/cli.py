@@ -194,7 +194,9 @@ def paper(
     configs: Annotated[Path, typer.Option("--configs", help="Folder of the experiments' bench files.")] = Path(
         "configs/paper"
     ),
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Scans of each method in each experiment.")] = 3,
+    seeds: Annotated[
+        int | None, typer.Option("--seeds", min=1, help="Scans of each method in each experiment; default: 3.")
+    ] = None,
     width_px: Annotated[
         int | None, typer.Option("--width-px", min=64, help="Columns of the camera; default: those of the files.")
     ] = None,
@@ -210,10 +212,11 @@ def paper(
     from scanner.terminal import Terminal
 
     terminal = Terminal(quiet)
-    wanted = Wanted(seeds, width_px)
+    wanted = Wanted(seeds or 3, width_px)
     if small:
-        wanted = replace(wanted, seeds=1, width_px=width_px or 256, noise_shape=(192, 256))
-    command = ["scan", "paper", "--configs", str(configs), *(["--small"] if small else ["--seeds", str(seeds)])]
+        wanted = replace(wanted, seeds=seeds or 1, width_px=width_px or 256, noise_shape=(192, 256))
+    command = ["scan", "paper", "--configs", str(configs), *(["--small"] if small else [])]
+    command += [] if seeds is None else ["--seeds", str(seeds)]
     command += [] if width_px is None else ["--width-px", str(width_px)]
 
     def scan(planned: Planned, place: Path) -> ScanResult:

@@ -41,6 +41,7 @@ class Decoder:
     _setup: Setup | None = field(default=None, init=False)
     _first: FirstRound | None = field(default=None, init=False)
     _maps: Maps | None = field(default=None, init=False)
+    _lacks: Plan | None = field(default=None, init=False)
 
     def first(self, frames: RoundFrames, noise: NoiseModel | None = None) -> Plan | None:
         """Decode round one; returns the plan of round two, or None where there is nothing more to do.
@@ -76,7 +77,10 @@ class Decoder:
             raise AssertionError("round two is decoded after round one")
         if len(frames.added) < len(frames.plan.sequences):
             self.give_up_regional(frames.plan)
-            return None
+            if not isinstance(self.method, RepeatedlyRegional):
+                return None
+            self._first = self.method.skip(self._first)
+            return self.method.second_round(self._first, self._setup)
         setup = self._setup if noise is None else replace(self._setup, noise=noise)
         if not isinstance(self.method, RepeatedlyRegional):
             self._maps = self.method.fuse(self._first, frames, setup)
@@ -93,28 +97,28 @@ class Decoder:
         return 1 if self._first is None else 1 + self._first.regional
 
     def give_up_regional(self, plan: Plan) -> None:
-        """Say of the pixels that only this regional round could have told that the recording ended before it."""
-        maps = self.maps
-        flags = maps.flags.copy()
-        flags[maps.interreflection & ~maps.valid] |= np.uint16(Flag.INCOMPLETE)
-        if maps.lit is None:
-            self._maps = replace(maps, flags=flags, lit=plan.mask)
-            self.warnings.append(
-                "round two is not complete: the bounce region holds what round one could separate, and nothing else"
-            )
-        else:
-            self._maps = replace(maps, flags=flags)
+        """Say of the pixels that only this regional round could have told that the recording lacks it."""
+        if self._lacks is None:
             self.warnings.append(
                 "the regional rounds are not complete: the rest of the bounce region holds what round one could "
                 "separate, and nothing else"
+                if self.rounds > 2
+                else "round two is not complete: the bounce region holds what round one could separate, and nothing "
+                "else"
             )
+        self._lacks = plan
 
     @property
     def maps(self) -> Maps:
         """The result so far."""
         if self._maps is None:
             raise AssertionError("nothing was decoded yet")
-        return self._maps
+        if self._lacks is None:
+            return self._maps
+        maps = self._maps
+        flags = maps.flags.copy()
+        flags[maps.interreflection & ~maps.valid] |= np.uint16(Flag.INCOMPLETE)
+        return replace(maps, flags=flags, lit=self._lacks.mask if maps.lit is None else maps.lit)
 
     def noise_of(self, frames: RoundFrames) -> NoiseModel:
         """What the frames show goes before what the camera promises: it holds vibration and flicker too."""

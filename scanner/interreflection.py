@@ -29,6 +29,9 @@ _SMALLEST_REGION = 12
 MOST_EVIDENCE = 3 * BOUNDARY_PRICE
 """A single pixel never says more than its own boundary costs: no region stands on one pixel."""
 
+FEWEST = 100
+"""Fewer pixels tell nothing of the noise."""
+
 _MOST_UNEVEN = 1.5
 """The better quarter of clean pixels fits worse than the best fiftieth by less than this; more is bounces."""
 
@@ -251,7 +254,7 @@ def excess_misfit(statistic: NDArray[np.float32], dof: int, usable: NDArray[np.b
 
 def _relative_quantile(statistic: NDArray[np.float32], dof: int, usable: NDArray[np.bool_], share: float) -> float:
     values = statistic[usable]
-    if values.size < 100:
+    if values.size < FEWEST:
         return 1.0
     quantile = np.quantile(values[:: max(1, values.size // 200_000)], share)
     return float(quantile) / float(chi2_distribution.ppf(share, dof))

@@ -40,6 +40,9 @@ def process_take(
         No axis can be told from the sequences that are there.
     """
     method = METHODS[str(take.manifest["method"])]
+    # What was recorded is planned again, whatever is allowed today.
+    allowed = take.manifest.get("config", {}).get("scan", {}).get("max_regional_sequences", scan.max_regional_sequences)
+    scan = scan.model_copy(update={"max_regional_sequences": max(allowed, len(take.rounds) - 1)})
     began = time.perf_counter()
     decoder = Decoder(method, scan, take.noise, rig)
     warnings = list(take.problems)

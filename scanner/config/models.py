@@ -229,7 +229,8 @@ class ScanSection(_Section):
     rounds: Literal["auto", 1, 2] = Field(
         2,
         description="Rounds of mfs. 2: a second round follows wherever a bounce was detected; auto: only where the "
-        "separation of both light paths from round one alone does not suffice; 1: never. The other methods have one.",
+        "separation of both light paths from round one alone does not suffice; 1: never. For mfs_paper auto is 2; "
+        "the other methods have one.",
     )
     max_regional_sequences: int = Field(
         1,

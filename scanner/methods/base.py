@@ -143,6 +143,10 @@ class RepeatedlyRegional(Protocol):
         """
         ...
 
+    def skip(self, first: FirstRound) -> FirstRound:
+        """Go on without the regional sequence that `Method.second_round` has planned."""
+        ...
+
 
 @dataclass
 class KeptFrames:

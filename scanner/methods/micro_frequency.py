@@ -18,6 +18,7 @@ from scipy.stats import chi2 as chi2_distribution
 from drivers import FrameFormat
 from scanner.config import ScanSection
 from scanner.interreflection import (
+    FEWEST,
     Detection,
     detect,
     detect_pooled,
@@ -35,7 +36,17 @@ from scanner.methods.base import (
     stepped_plan,
 )
 from scanner.methods.multi_frequency import DecodedAxis, decode_axes, one_path_maps
-from scanner.methods.regional import AXES, WORTH, Regional, again, begin, lit_here, plane, remaining
+from scanner.methods.regional import (
+    AXES,
+    MOST_SEQUENCES,
+    WORTH,
+    Regional,
+    again,
+    begin,
+    lit_here,
+    plane,
+    remaining,
+)
 from scanner.methods.separated import Separated, phasors_of, separate_region
 from scanner.methods.sufficiency import Evidence, weigh
 from scanner.patterns import Axis, Plan
@@ -217,7 +228,10 @@ class MicroFrequencyShifting:
         target = (_dilated(region, _HALO_PX) & ~private.detection.depth_edge) | (state.served & own)
         here = lit_here(lit, found.x_p, found.y_p)
         # Where bounces cover the picture, round one overrates the noise; a sequence without them does not.
-        excess = min(private.detection.excess_noise, excess_noise(total, dof, target & usable & here))
+        counted = target & usable & here
+        excess = private.detection.excess_noise
+        if np.count_nonzero(counted) >= FEWEST:
+            excess = min(excess, excess_noise(total, dof, counted))
         limit = chi2_distribution.isf(1 / _REFUSED_ONE_IN, dof) * excess
         fits = total < np.float32(limit)
         misfit = total / np.float32(dof)
@@ -232,6 +246,7 @@ class MicroFrequencyShifting:
         state = replace(
             state,
             sequence=np.where(passed, np.uint8(state.taken), state.sequence),
+            doubted=state.doubted & ~passed,
             modulation=np.where(passed, found.modulation, state.modulation),
             misfit=np.where(passed, misfit, state.misfit),
         )
@@ -273,7 +288,15 @@ class MicroFrequencyShifting:
             regional=max(state.planned, 1),
             notes=[],
         )
-        return _concluded(joined, first.decision, region, state)
+        more = setup.scan.regional_rule == "sound" and len(decoded) == 2 and state.most < MOST_SEQUENCES
+        return _concluded(joined, first.decision, region, state, more)
+
+    def skip(self, first: FirstRound) -> FirstRound:
+        """Go on without the sequence that `second_round` has planned."""
+        assert isinstance(first.private, _Private)
+        state = first.private.regional
+        state = replace(state, queue=state.queue[1:], taken=state.taken + 1)
+        return replace(first, private=replace(first.private, regional=state), notes=[])
 
     @staticmethod
     def _learned(
@@ -296,7 +319,7 @@ class MicroFrequencyShifting:
         return replace(
             state,
             failed=np.where(np.isfinite(paths[:1]), paths, state.failed),
-            doubted=(state.doubted & ~passed) | (still.region & (passed | (state.sequence == 0))),
+            doubted=state.doubted | (still.region & (passed | (state.sequence == 0))),
         )
 
 
@@ -309,8 +332,8 @@ def _near(maps: Maps, x: NDArray[np.float32] | None, y: NDArray[np.float32] | No
     return near
 
 
-def _concluded(first: FirstRound, said: str, region: NDArray[np.bool_], state: Regional) -> FirstRound:
-    """Say after the last sequence how many there were, and what they have left."""
+def _concluded(first: FirstRound, said: str, region: NDArray[np.bool_], state: Regional, more: bool) -> FirstRound:
+    """Say after the last sequence how many there were, what they have left, and whether ``more`` could be allowed."""
     if state.queue:
         return first
     rest = int(remaining(state, region).sum())
@@ -321,7 +344,7 @@ def _concluded(first: FirstRound, said: str, region: NDArray[np.bool_], state: R
         notes.append(
             f"{100 * share:.1f} % of the bounce region's pixels still see a bounce after {state.taken} regional "
             f"sequence{'s' * (state.taken > 1)}, or could not be lit: they hold what round one separates, or nothing"
-            + ("; scan.max_regional_sequences allows more" if state.taken >= state.most else "")
+            + ("; scan.max_regional_sequences allows more" if more and state.taken >= state.most else "")
         )
     return replace(first, decision="; ".join(t for t in (said, told) if t), notes=notes)
 

@@ -82,7 +82,7 @@ class LiteralMicroFrequencyShifting:
     def second_round(self, first: FirstRound, setup: Setup) -> Plan | None:
         """Black where an undetected pixel's coordinate lies, the same fringes everywhere else (Eq. 21)."""
         undetected = ~first.maps.interreflection
-        if undetected.all():
+        if undetected.all() or setup.scan.rounds == 1:
             return None
         nothing = np.full(int(undetected.sum()), np.nan, np.float32)
         x, y = first.maps.x_p_round1, first.maps.y_p_round1

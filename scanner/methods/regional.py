@@ -40,6 +40,9 @@ _CLEARANCE_PITCHES = 2.0
 CLOSE_PATHS_PX = 32.0
 """Two fringes: between paths nearer than this others may meet unseen."""
 
+MOST_SEQUENCES = 8
+"""One bit of `Maps.lit_by` each."""
+
 WORTH = 0.01
 """Share of the region's pixels for which another sequence is taken."""
 
@@ -267,6 +270,8 @@ def again(
     group = np.full(rest.shape, -1, np.int8)
     x, y, from_x, from_y = (p[known] for p in paths)
     group[known] = group_places(x, y, from_x, from_y, budget)
+    if group.max() < 1:
+        group = np.where(known & lit_together(*paths), np.int8(0), np.int8(-1))
     nothing = np.zeros_like(rest)
     between, located = rest & (group < 0), np.isfinite(paths[2])
     x, y, group, masks = _masks(
@@ -285,7 +290,9 @@ def again(
 
 def remaining(regional: Regional, region: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(H, W) bool, pixels of the region with a known direct place that no sequence has measured without a bounce."""
-    return np.asarray(region & ((regional.sequence == 0) | regional.doubted) & np.isfinite(regional.x))
+    return np.asarray(
+        region & ((regional.sequence == 0) | regional.doubted) & (np.isfinite(regional.x) | np.isfinite(regional.y))
+    )
 
 
 def plane(separated: Separated, values: NDArray[np.float32] | None) -> NDArray[np.float32]:

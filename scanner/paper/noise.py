@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from scanner.folder import DETECTION_STUDY, write_json
+from scanner.paper.shelf import program
 from scanner.studies import detection, figures
 from scanner.studies.ideal import AMPLITUDE_DN, MEAN_DN, curved_scene
 
@@ -48,7 +49,7 @@ def study_noise(folder: Path, seeds: int, shape: tuple[int, int], report: Callab
         Is told what is being done.
     """
     numbers = list(range(201, 201 + seeds))
-    asked = {"seeds": numbers, "shape": list(shape), "false_alarm_rate": FALSE_ALARM_RATE}
+    asked = {"program": program(), "seeds": numbers, "shape": list(shape), "false_alarm_rate": FALSE_ALARM_RATE}
     path = folder / DETECTION_STUDY
     if path.is_file():
         known = json.loads(path.read_text("utf-8"))

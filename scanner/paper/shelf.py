@@ -7,9 +7,11 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import scanner
 from scanner.comparison import Trial
 from scanner.comparison.running import Planned
 from scanner.folder import OutputError, read_result, write_json
@@ -110,11 +112,20 @@ class Shelf:
 
 
 def fingerprint(planned: Planned) -> str:
-    """SHA-256 of all settings that a scan and its figures depend on."""
+    """SHA-256 of all that a scan and its figures depend on: settings and program."""
     document = planned.loaded.config.model_dump(mode="json")
     document["compare"] = {k: v for k, v in document["compare"].items() if k in ("windows", "least_alpha", "fit")}
-    parts = {"name": planned.name, **{k: document[k] for k in ("bench", "scan", "compare")}}
+    parts = {"name": planned.name, "program": program(), **{k: document[k] for k in ("bench", "scan", "compare")}}
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+@cache
+def program() -> str:
+    """SHA-256 of this package's sources: what another state of it has made is made again."""
+    digest = hashlib.sha256()
+    for file in sorted(Path(scanner.__file__).parent.rglob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
 
 
 def _known(values: Mapping[str, float | None]) -> dict[str, float]:

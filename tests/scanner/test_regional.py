@@ -5,6 +5,8 @@ The scenes, poses and seeds of this file were not used to set anything.
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 from conftest import ArrayBench
@@ -118,6 +120,28 @@ def test_a_recording_that_ends_within_a_regional_sequence_holds_those_before(tmp
     assert (maps.flags[lost] & Flag.INCOMPLETE).all()
     right = np.abs(maps.x_p - bench.x)[measured]
     assert lost_in == 2 or (right < 0.25).mean() > 0.97
+
+
+def test_a_regional_round_that_is_damaged_costs_what_it_has_measured(both, tmp_path):
+    _, job, folder = both
+    place = tmp_path / "take"
+    shutil.copytree(folder / "take", place)
+    take = Take.open(place)
+    broken = take.sequences(2)[3].frames[0].slot
+    with (place / "frames.bin").open("r+b") as file:
+        file.seek(broken * take.manifest["stride"])
+        file.write(b"\xff" * 2000)
+    result = process_take(Take.open(place), job.scan, GatesSection(), None)
+    maps, whole = result.maps, job.decoder.maps
+    assert any("the regional rounds are not complete" in w for w in result.warnings)
+    assert not (maps.sequence == 1).any()
+    # What the other round was meant for is as it was; the rest of the region holds what round one separates.
+    same = whole.sequence == 2
+    assert (maps.sequence[same] == 2).all()
+    np.testing.assert_array_equal(maps.x_p[same], whole.x_p[same])
+    lost = maps.interreflection & (whole.sequence == 1)
+    assert (maps.flags[lost] & (Flag.SEPARATED | Flag.INCOMPLETE | Flag.SECOND_ROUND)).all()
+    assert not (maps.flags[maps.interreflection & maps.valid] & Flag.INCOMPLETE).any()
 
 
 def test_progress_counts_the_sequences_that_are_planned(tmp_path):
