@@ -65,6 +65,8 @@ class CountingClock:
 class ArrayBench:
     """Pixel = ambient + gain·(P(x, y) + α·P(x', y')) + noise, P the picture between its pixels.
 
+    The noise is that of reading and, with ``dn_per_electron``, of light.
+
     ``on_expose(number, index)`` may raise, or return the index of the picture that is really exposed.
     """
 
@@ -77,6 +79,7 @@ class ArrayBench:
     gain: float = 0.6
     ambient: float = 4.0
     sigma: float = 1.5
+    dn_per_electron: float = 0.0
     seed: int = 0
     rig: Any = None
     on_expose: Any = None
@@ -101,7 +104,7 @@ class ArrayBench:
 
     @property
     def noise(self) -> NoiseModel | None:
-        return NoiseModel(float(np.sqrt(self.sigma**2 + 1 / 12)))
+        return NoiseModel(float(np.sqrt(self.sigma**2 + 1 / 12)), self.dn_per_electron)
 
     def prepare(self, patterns) -> None:
         self._pictures = [p.astype(np.float32) for p in patterns]
@@ -122,7 +125,8 @@ class ArrayBench:
             answer = self.on_expose(number, index)
             shown = index if answer is None else answer
         ideal = self.light(self._pictures[shown])
-        out[:] = np.clip(np.rint(ideal + self._rng.normal(0, self.sigma, ideal.shape)), 0, 255)
+        deviation = np.sqrt(self.sigma**2 + self.dn_per_electron * np.maximum(ideal, 0))
+        out[:] = np.clip(np.rint(ideal + deviation * self._rng.normal(0, 1, ideal.shape)), 0, 255)
         self.clock.sleep(0.05)
         return FrameStamp(number, self.clock.now(), self.clock.now(), self.clock.now())
 

@@ -126,7 +126,7 @@ def noise_of(values: NDArray[np.float32], valid: NDArray[np.bool_], lit: NDArray
     valid
         (P,) pixels that may be asked at all.
     lit
-        (P,) those that matter. The darkness around them is asked as well: it has no more noise, and more pixels.
+        (P,) those that matter. All others are asked as well: they are more, and darkness has no more noise than light.
     least
         What rounding alone makes.
     """

@@ -35,6 +35,9 @@ FEWEST = 60
 """Pixels with fringes below which nothing can be said."""
 
 _CLEAR = 6.0
+_LITTLE = 0.5
+"""Less light than this share of what was taken for lit, and it was darkness that told the noise."""
+
 _MORE_NOISE = 1.25
 _FEWEST_OF_TILE = 40
 _SIGNIFICANT = 6.5
@@ -169,21 +172,31 @@ def fit(
     z = re + np.complex64(1j) * im
     modulation = np.abs(z)
     rest = unexplained.T @ values
-    lit = valid & (modulation > 0.25 * np.quantile(modulation, 0.9))
-    if orders > 1 or (len(rest) and reference is None):
-        sigma = noise_of(rest, valid, lit, ROUNDING_DN)
-    elif reference is not None:
-        against = (mean - reference.mean)[None]
-        sigma = noise_of(against, valid & reference.known, lit, 0.0) / reference.noise_gain(count)
-        sigma = max(sigma, ROUNDING_DN)
-    else:
+
+    def noise(lit: NDArray[np.bool_]) -> float:
+        if orders > 1 or (len(rest) and reference is None):
+            return noise_of(rest, valid, lit, ROUNDING_DN)
+        if reference is not None:
+            against = (mean - reference.mean)[None]
+            found = noise_of(against, valid & reference.known, lit, 0.0) / reference.noise_gain(count)
+            return max(found, ROUNDING_DN)
         # Three steps leave no residual. But the texture of an object changes mean and modulation alike.
         contrast = float(np.median(modulation[lit] / np.maximum(mean[lit], 1))) if lit.any() else 0.0
-        sigma = noise_of((modulation - np.float32(contrast) * mean)[None], valid, lit, 0.0)
-        sigma = max(sigma / float(np.sqrt((2 + contrast**2) / count)), ROUNDING_DN)
-    sigma = min(sigma, _MORE_NOISE * former_noise_dn)
-    clear = _CLEAR * sigma * float(np.linalg.norm(solve[1]))
-    usable = valid & (modulation > clear)
+        found = noise_of((modulation - np.float32(contrast) * mean)[None], valid, lit, 0.0)
+        return max(found / float(np.sqrt((2 + contrast**2) / count)), ROUNDING_DN)
+
+    lit = valid & (modulation > 0.25 * np.quantile(modulation, 0.9))
+    most = _MORE_NOISE * former_noise_dn
+    sigma = min(noise(lit), most)
+    gain = _CLEAR * float(np.linalg.norm(solve[1]))
+    usable = valid & (modulation > gain * sigma)
+    if 0 < np.count_nonzero(usable) < _LITTLE * np.count_nonzero(lit):
+        # Nearly all was dark, and darkness has less noise than light.
+        bright = usable & (modulation > 0.25 * np.quantile(modulation[usable], 0.9))
+        former = former_noise_dn if np.isfinite(former_noise_dn) else 0.0
+        sigma = max(sigma, min(noise(bright), most), former)
+        usable = valid & (modulation > gain * sigma)
+    clear = gain * sigma
     visible = np.square(unexplained, dtype=np.float64).sum(axis=1)
     errors = np.empty((count, 0), np.float32)
     if len(rest) and usable.any():
