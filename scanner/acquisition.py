@@ -350,7 +350,7 @@ class Acquisition:
                 series,
                 cast("list[ExposurePass]", passes),
                 lambda exposure, sequence: self._recorded(number, exposure * len(plan.sequences) + sequence),
-                self.decoder.noise_of,
+                self.decoder.noise_at,
             )
         for warning in fused.warnings:
             self._note(f"round {number}: {warning}")

@@ -42,6 +42,8 @@ class Decoder:
     _first: FirstRound | None = field(default=None, init=False)
     _maps: Maps | None = field(default=None, init=False)
     _lacks: Plan | None = field(default=None, init=False)
+    _noises: dict[int, NoiseModel] = field(default_factory=dict, init=False)
+    _told: set[str] = field(default_factory=set, init=False)
 
     def first(self, frames: RoundFrames, noise: NoiseModel | None = None) -> Plan | None:
         """Decode round one; returns the plan of round two, or None where there is nothing more to do.
@@ -126,21 +128,31 @@ class Decoder:
         if observed is None:
             if self.noise is None:
                 self._warn(
-                    f"neither camera nor frames tell the noise: {_ASSUMED_NOISE.read_dn:g} DN is assumed, and σ with it"
+                    "unknown",
+                    f"neither camera nor frames tell the noise: {_ASSUMED_NOISE.read_dn:g} DN is assumed, and σ with "
+                    "it",
                 )
             return self.noise or _ASSUMED_NOISE
         if self.noise is not None:
             ratio = _middle_sigma(observed) / _middle_sigma(self.noise)
             if ratio > 1.3:
                 self._warn(
+                    "noisy",
                     f"the frames are {ratio:.1f} × as noisy as the camera's model says: vibration, flicker, or a "
-                    "projector response that is not linear"
+                    "projector response that is not linear",
                 )
         return observed
 
-    def _warn(self, text: str) -> None:
+    def noise_at(self, exposure: int, frames: RoundFrames) -> NoiseModel:
+        """Noise of the frames of one exposure as round one has it: what later rounds show is mostly dark."""
+        if exposure not in self._noises:
+            self._noises[exposure] = self.noise_of(frames)
+        return self._noises[exposure]
+
+    def _warn(self, kind: str, text: str) -> None:
         """Say something once, however many exposures show it."""
-        if text not in self.warnings:
+        if kind not in self._told:
+            self._told.add(kind)
             self.warnings.append(text)
 
 

@@ -115,6 +115,20 @@ def along_rays(rig: Rig, names: list[str], covariance: Array, px: Array, depth: 
     return np.asarray(np.sqrt(total))
 
 
+def check_covariance(rig: Rig) -> None:
+    """Refuse a rig whose covariance `sigma_rig` could not use, before anything is projected for it.
+
+    Raises
+    ------
+    RigError
+        As `sigma_rig`.
+    """
+    stated = _stated(rig)
+    if stated is not None:
+        names = [name for name in stated[0] if not name.startswith("board.")]
+        _moved(rig, names, np.zeros(len(names)))
+
+
 def _stated(rig: Rig) -> tuple[list[str], Array] | None:
     document = rig.metadata.get("calibration", {})
     if not isinstance(document, Mapping) or not {"parameters", "covariance"} <= document.keys():

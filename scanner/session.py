@@ -19,6 +19,7 @@ from scanner.quality import summarise
 from scanner.response import corrected_for, response_of
 from scanner.result import ScanResult
 from scanner.rig import Rig
+from scanner.rig_uncertainty import check_covariance
 from scanner.take import TakeWriter
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ def run_scan(
             light = None if response is None else response.values
             plan = replace(method.first_round(config.scan, bench.projector_size), response=light)
             exposures = agree(bench, config.scan.exposures)
-            rounds = config.scan.rounds_at_most(method.rounds)
+            rounds = config.scan.rounds_to_record(method.rounds)
             with _begin_take(folder.path / "take", loaded, bench, rig, plan, rounds, exposures) as take:
                 decoder = Decoder(method, config.scan, bench.noise, rig)
                 acquisition = Acquisition(bench, method, config.scan, decoder, take, listener, light, exposures)
@@ -117,6 +118,8 @@ def find_rig(loaded: LoadedConfig, bench: Bench) -> Rig:
     ------
     ConfigError
         There is none, or it belongs to another camera or projector.
+    RigError
+        It states a covariance that cannot be used.
     """
     if loaded.rig_path is not None:
         rig = Rig.load(loaded.rig_path)
@@ -139,6 +142,7 @@ def find_rig(loaded: LoadedConfig, bench: Bench) -> Rig:
                 f"the rig's {what} has {found[0]} × {found[1]} px, the bench's has {wanted[0]} × {wanted[1]} px",
                 f"name the rig that was calibrated with this {what} at this resolution",
             )
+    check_covariance(rig)
     return rig
 
 

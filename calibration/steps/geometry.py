@@ -113,6 +113,7 @@ def fringes(work: Work, projector_size: tuple[int, int]) -> ScanSection:
         "method": "tps",
         "steps": work.settings.geometry.steps,
         "frequencies_per_px": None,
+        "exposures": [1],
         "periods_px": {axis: periods[axis] for axis in work.loaded.config.scan.axes},
     }
     return ScanSection.model_validate_json(json.dumps(wanted))

@@ -300,6 +300,11 @@ class ScanSection(_Section):
         """Rounds that a scan can take by a method that has ``of_method``."""
         return 1 if self.rounds == 1 else of_method
 
+    def rounds_to_record(self, of_method: int) -> int:
+        """Rounds that the disk must have room for: every regional sequence is a round of its own."""
+        regional = self.max_regional_sequences if self.method == "mfs" and self.regional_rule == "sound" else 1
+        return self.rounds_at_most(of_method) - 1 + regional if self.rounds_at_most(of_method) > 1 else 1
+
     def fringe_field(self, axis: Axis) -> FieldPath | None:
         """Path, below this section, of the list of the fringes along ``axis``; None for the method's own."""
         for name, given in (("periods_px", self.periods_px), ("frequencies_per_px", self.frequencies_per_px)):

@@ -222,7 +222,7 @@ def _planned(loaded: LoadedConfig, rig: Rig | None) -> Planned | Finding:
         plan = method.first_round(scan, (pattern[0], pattern[1]))
     except OperatorError as error:
         return Finding("configuration", "plan", Verdict.FAULT, error.message, error.remedy)
-    rounds = scan.rounds_at_most(method.rounds)
+    rounds = scan.rounds_to_record(method.rounds)
     return Planned(plan, rounds, (frame[0], frame[1]), 1 if _bits(camera) <= 8 else 2, len(scan.exposures))
 
 

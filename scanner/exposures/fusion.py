@@ -167,7 +167,7 @@ def fuse(
     series: ExposureSeries,
     passes: Sequence[ExposurePass],
     read: Source,
-    noise_of: Callable[[RoundFrames], NoiseModel],
+    noise_of: Callable[[int, RoundFrames], NoiseModel],
 ) -> Fused:
     """Fuse the exposures of a round and have the method collect the result, one sequence at a time.
 
@@ -183,7 +183,7 @@ def fuse(
     read
         Reads the frames again.
     noise_of
-        Noise model of the frames of one pass.
+        Noise model of the frames of one exposure, by its number and its pass.
     """
     whole = [k for k, p in enumerate(passes) if p.complete]
     chosen = whole or [max(range(len(passes)), key=lambda k: len(passes[k].added))]
@@ -194,7 +194,7 @@ def fuse(
         if not p.complete
     ]
     kept, relative = [passes[k] for k in chosen], [series.relative[k] for k in chosen]
-    noises = [noise_of(p) for p in kept]
+    noises = [noise_of(k, passes[k]) for k in chosen]
     weights = weigh(kept, relative, noises)
     fmt = kept[0].frame_format
     wide = FusedFormat(fmt.width, fmt.height, fmt.bits, fmt.saturated_dn / min(relative))

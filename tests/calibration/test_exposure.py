@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from calibration.exposure import search_exposure
+from calibration.steps.geometry import fringes
+from scanner.config import ScanSection
 
 PERIOD_S = 1 / 60
 PERIOD_US = 1e6 / 60
@@ -118,3 +122,12 @@ def test_limits_that_allow_nothing_are_refused():
         search(Camera(1e-3), minimum_us=20_000, maximum_us=30_000, period_s=PERIOD_S)
     with pytest.raises(ValueError, match="maximum"):
         search(Camera(1e-3), minimum_us=20, maximum_us=10)
+
+
+def test_boards_are_photographed_at_one_exposure_whatever_scans_take():
+    scan = ScanSection(exposures=(1.0, 0.25))
+    work = SimpleNamespace(
+        loaded=SimpleNamespace(config=SimpleNamespace(scan=scan)),
+        settings=SimpleNamespace(geometry=SimpleNamespace(steps=8)),
+    )
+    assert fringes(work, (640, 400)).exposures == (1.0,)

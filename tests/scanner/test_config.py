@@ -962,3 +962,11 @@ def test_importing_the_configuration_imports_nothing_heavy() -> None:
     code = f"import sys, scanner.config; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY)
     assert done.stdout.strip() == "[]"
+
+
+def test_every_regional_sequence_needs_room_on_the_disk():
+    assert cfg.ScanSection().rounds_to_record(2) == 2
+    assert cfg.ScanSection(max_regional_sequences=4).rounds_to_record(2) == 5
+    assert cfg.ScanSection(max_regional_sequences=4, rounds=1).rounds_to_record(2) == 1
+    assert cfg.ScanSection(max_regional_sequences=4, regional_rule="literal").rounds_to_record(2) == 2
+    assert cfg.ScanSection(max_regional_sequences=4, method="tps").rounds_to_record(1) == 1

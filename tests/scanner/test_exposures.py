@@ -162,6 +162,20 @@ def test_two_rounds_fuse_each_and_the_bounce_goes(array_bench, tmp_path):
     assert np.array_equal(again.maps.x_p, maps.x_p, equal_nan=True)
 
 
+def test_a_dark_round_does_not_lower_the_noise(array_bench, tmp_path):
+    # Round two lights little of the picture; its σ is that of the light there, as round one has measured it.
+    bench = graded_bench(alpha=np.zeros_like(array_bench().alpha), seed=14)
+    bench.alpha[50:64][zone(bench, MATT)[50:64]] = 0.5
+    job = job_of(bench, tmp_path, "mfs", steps=4, exposures=(1.0, 0.5))
+    noises = []
+    at = job.decoder.noise_at
+    job.decoder.noise_at = lambda exposure, frames: noises.append((exposure, at(exposure, frames))) or noises[-1][1]
+    run(job)
+    assert [exposure for exposure, _ in noises] == [0, 1, 0, 1]
+    for exposure, noise in noises:
+        assert noise.variance(120.0) == pytest.approx(READ**2 + 1 / 12 + 120 * ELECTRONS, rel=0.25), exposure
+
+
 def test_newer_takes_are_told_from_older_ones(fused):
     _, job, _ = fused
     assert json.loads((job.take.path / "manifest.json").read_text())["schema"] == 2

@@ -6,7 +6,7 @@ import pytest
 
 from scanner import optics
 from scanner.rig import Lens, Rig, RigError
-from scanner.rig_uncertainty import along_rays, sigma_rig
+from scanner.rig_uncertainty import along_rays, check_covariance, sigma_rig
 from scanner.triangulation import triangulate
 
 SIZE = (64, 48)
@@ -145,5 +145,9 @@ def test_a_covariance_that_fits_no_rig_is_refused(fault):
     else:
         document["parameters"] = [*names[:-1], "tripod.height"]
     depth, maps = _scene()
+    rig = _rig(metadata={"calibration": document})
     with pytest.raises(RigError, match="covariance"):
-        sigma_rig(_rig(metadata={"calibration": document}), depth, maps[1], maps[3])
+        sigma_rig(rig, depth, maps[1], maps[3])
+    # And before a scan.
+    with pytest.raises(RigError, match="covariance"):
+        check_covariance(rig)
