@@ -14,6 +14,7 @@ from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from multiprocessing import get_context
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -270,9 +271,9 @@ def corruption(plan, sequence, light, camera, exposures, wrong) -> float:
     sigma = camera.noise.read_dn
     if fringes.frequency is None:
         extent = plan.extent(fringes.axis)
-        true, _, sigma_z = nearest_code(right, fringes, extent, NoiseModel(sigma))
-        found, _, _ = nearest_code(right + error, fringes, extent, NoiseModel(sigma))
-        kept = (true.lead > 7) & (found.lead > 7) & (true.amplitude > 8 * sigma_z)
+        measured = nearest_code(right, fringes, extent, NoiseModel(sigma))
+        true, found = measured.coordinates, nearest_code(right + error, fringes, extent, NoiseModel(sigma)).coordinates
+        kept = (true.lead > 7) & (found.lead > 7) & (true.amplitude > 8 * measured.sigma_z)
         # One order too far counts as ten times the noise: in a hundredth of the pixels it is as bad as noise in all.
         moved = np.minimum(np.abs(found.u - true.u) / true.sigma, 10)[kept]
         return float(np.sqrt(np.square(moved).mean())) if moved.size else 0.0
@@ -334,3 +335,14 @@ def test_the_books_know_a_wrong_frame_that_the_check_is_kept_from_seeing(monkeyp
     tally = Tally()
     scan("mfs", 12, 0, RATES, tally)
     assert tally.undetected
+
+
+@pytest.mark.parametrize(("method", "steps"), [("mfs", 12), ("mps_gn", 12)])
+def test_the_books_measure_what_an_error_does(method, steps):
+    light = Formula(np.random.default_rng(3), 1.0)
+    plan = METHODS[method].first_round(ScanSection(method=method, steps=steps), PROJECTOR)
+    camera = SimpleNamespace(noise=NoiseModel(1.5))
+    exposures = list(range(len(plan.sequences[0])))
+    assert corruption(plan, 0, light, camera, exposures, {}) == 0
+    broken = {4: SimpleNamespace(error_dn=np.full(SHAPE, 60, np.float32))}
+    assert corruption(plan, 0, light, camera, exposures, broken) > 1
