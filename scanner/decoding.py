@@ -12,6 +12,7 @@ from scanner.methods import FirstRound, Method, RepeatedlyRegional, RoundFrames,
 from scanner.patterns import Plan
 from scanner.result import Flag, Maps
 from scanner.rig import Rig
+from scanner.rig_uncertainty import covariance_fault
 
 _ASSUMED_NOISE = NoiseModel(1.5)
 """Where neither the camera nor the frames tell: an ordinary 8-bit camera."""
@@ -44,6 +45,11 @@ class Decoder:
     _lacks: Plan | None = field(default=None, init=False)
     _noises: dict[int, NoiseModel] = field(default_factory=dict, init=False)
     _told: set[str] = field(default_factory=set, init=False)
+
+    def __post_init__(self) -> None:
+        fault = None if self.rig is None else covariance_fault(self.rig)
+        if fault is not None:
+            self.warnings.append(fault)
 
     def first(self, frames: RoundFrames, noise: NoiseModel | None = None) -> Plan | None:
         """Decode round one; returns the plan of round two, or None where there is nothing more to do.
@@ -144,8 +150,20 @@ class Decoder:
         return observed
 
     def noise_at(self, exposure: int, frames: RoundFrames) -> NoiseModel:
-        """Noise of the frames of one exposure as round one has it: what later rounds show is mostly dark."""
+        """Noise of the frames of one exposure as round one has it: what later rounds show is mostly dark.
+
+        An exposure that round one lacks has the noise of the one nearest to the bench's own.
+
+        Parameters
+        ----------
+        exposure
+            Its number in the series.
+        frames
+            Of it, in this round.
+        """
         if exposure not in self._noises:
+            if self._setup is not None:
+                return NoiseModel(self._setup.noise.read_dn, self._setup.noise.dn_per_electron)
             self._noises[exposure] = self.noise_of(frames)
         return self._noises[exposure]
 

@@ -18,7 +18,6 @@ from scanner.quality import summarise
 from scanner.response import corrected_for
 from scanner.result import ScanResult
 from scanner.rig import Rig
-from scanner.rig_uncertainty import check_covariance
 from scanner.take import Take, TakeError
 
 Report = Callable[[str], None]
@@ -44,8 +43,6 @@ def process_take(
     # What was recorded is planned again, whatever is allowed today.
     allowed = take.manifest.get("config", {}).get("scan", {}).get("max_regional_sequences", scan.max_regional_sequences)
     scan = scan.model_copy(update={"max_regional_sequences": max(allowed, len(take.rounds) - 1)})
-    if rig is not None:
-        check_covariance(rig)
     began = time.perf_counter()
     decoder = Decoder(method, scan, take.noise, rig)
     warnings = list(take.problems)

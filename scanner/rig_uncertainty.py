@@ -47,14 +47,10 @@ def sigma_rig(rig: Rig, depth: Map, sigma_x: Map | None, sigma_y: Map | None) ->
 
     Returns
     -------
-    (H, W) mm, NaN where there is no point; None for a rig that states no covariance.
-
-    Raises
-    ------
-    RigError
-        The covariance does not fit its parameters, or names one that no rig has.
+    (H, W) mm, NaN where there is no point; None for a rig that states no covariance, or one that cannot be used
+    (`covariance_fault`).
     """
-    stated = _stated(rig)
+    stated = None if covariance_fault(rig) is not None else _stated(rig)
     if stated is None:
         return None
     out = np.full(depth.shape, np.nan, np.float32)
@@ -96,6 +92,11 @@ def along_rays(rig: Rig, names: list[str], covariance: Array, px: Array, depth: 
     Returns
     -------
     (...) mm.
+
+    Raises
+    ------
+    RigError
+        ``names`` holds one that no rig has.
     """
     ours = [i for i, name in enumerate(names) if not name.startswith("board.")]
     variance, axes = np.linalg.eigh(covariance[np.ix_(ours, ours)])
@@ -115,25 +116,32 @@ def along_rays(rig: Rig, names: list[str], covariance: Array, px: Array, depth: 
     return np.asarray(np.sqrt(total))
 
 
-def check_covariance(rig: Rig) -> None:
-    """Refuse a rig whose covariance `sigma_rig` could not use, before anything is projected for it.
+def covariance_fault(rig: Rig) -> str | None:
+    """Say why `sigma_rig` cannot use the covariance that a rig states; None where it can, or none is stated.
 
-    Raises
-    ------
-    RigError
-        As `sigma_rig`.
+    Another program may keep something else under the same names: its rig scans as well as any.
     """
-    stated = _stated(rig)
-    if stated is not None:
-        names = [name for name in stated[0] if not name.startswith("board.")]
-        _moved(rig, names, np.zeros(len(names)))
+    try:
+        stated = _stated(rig)
+        if stated is not None:
+            names = [name for name in stated[0] if not name.startswith("board.")]
+            _moved(rig, names, np.zeros(len(names)))
+    except RigError as error:
+        return f"{error.message}: points are without sigma_rig. {error.remedy}"
+    return None
 
 
 def _stated(rig: Rig) -> tuple[list[str], Array] | None:
     document = rig.metadata.get("calibration", {})
     if not isinstance(document, Mapping) or not {"parameters", "covariance"} <= document.keys():
         return None
-    names: list[Any] = list(document["parameters"])
+    names: Any = document["parameters"]
+    listed = isinstance(names, list | tuple) and all(isinstance(name, str) for name in names)
+    if not listed or len(set(names)) < len(names):
+        raise RigError(
+            "the covariance of the rig comes without a list of different names, one for each parameter",
+            "Calibrate again, or leave covariance out of the rig's metadata.",
+        )
     try:
         covariance = np.array(document["covariance"], np.float64)
     except (TypeError, ValueError):
@@ -143,7 +151,7 @@ def _stated(rig: Rig) -> tuple[list[str], Array] | None:
             f"the covariance of the rig is no table of {len(names)} × {len(names)} numbers, one for each parameter",
             "Take the rig file from a backup, calibrate again, or leave covariance out of its metadata.",
         )
-    return names, covariance
+    return list(names), covariance
 
 
 def _weight(sigma: Map | None) -> float:

@@ -19,7 +19,6 @@ from scanner.quality import summarise
 from scanner.response import corrected_for, response_of
 from scanner.result import ScanResult
 from scanner.rig import Rig
-from scanner.rig_uncertainty import check_covariance
 from scanner.take import TakeWriter
 
 if TYPE_CHECKING:
@@ -76,6 +75,8 @@ def run_scan(
             rounds = config.scan.rounds_to_record(method.rounds)
             with _begin_take(folder.path / "take", loaded, bench, rig, plan, rounds, exposures) as take:
                 decoder = Decoder(method, config.scan, bench.noise, rig)
+                for warning in decoder.warnings:  # before anything is projected
+                    listener.note(warning)
                 acquisition = Acquisition(bench, method, config.scan, decoder, take, listener, light, exposures)
                 maps = acquisition.run()
             simulated, name = bench.simulated, bench.name
@@ -118,8 +119,6 @@ def find_rig(loaded: LoadedConfig, bench: Bench) -> Rig:
     ------
     ConfigError
         There is none, or it belongs to another camera or projector.
-    RigError
-        It states a covariance that cannot be used.
     """
     if loaded.rig_path is not None:
         rig = Rig.load(loaded.rig_path)
@@ -142,7 +141,6 @@ def find_rig(loaded: LoadedConfig, bench: Bench) -> Rig:
                 f"the rig's {what} has {found[0]} × {found[1]} px, the bench's has {wanted[0]} × {wanted[1]} px",
                 f"name the rig that was calibrated with this {what} at this resolution",
             )
-    check_covariance(rig)
     return rig
 
 

@@ -114,6 +114,7 @@ def fringes(work: Work, projector_size: tuple[int, int]) -> ScanSection:
         "steps": work.settings.geometry.steps,
         "frequencies_per_px": None,
         "exposures": [1],
+        "max_regional_sequences": 1,
         "periods_px": {axis: periods[axis] for axis in work.loaded.config.scan.axes},
     }
     return ScanSection.model_validate_json(json.dumps(wanted))

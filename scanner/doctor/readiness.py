@@ -17,6 +17,7 @@ from scanner.doctor.machine import GB, Machine
 from scanner.methods import METHODS
 from scanner.patterns import Plan
 from scanner.rig import Rig
+from scanner.rig_uncertainty import covariance_fault
 from scanner.session import latency_of
 
 RESERVE = 1.2
@@ -98,6 +99,7 @@ def judge(loaded: LoadedConfig, machine: Machine | None, of_bench: Sequence[Find
     rig, findings = _rig(loaded, of_bench)
     yield from findings
     if rig is not None:
+        yield from _covariance(rig)
         yield from _sizes(rig, settings)
         yield from _latency(rig, of_bench or ())
     planned = _planned(loaded, rig)
@@ -176,6 +178,12 @@ def _about(rig: Rig) -> str:
     camera, projector = rig.camera.size, rig.projector.size
     source = f"; {rig.metadata['source']}" if isinstance(rig.metadata.get("source"), str) else ""
     return f"camera {camera[0]} × {camera[1]} px, projector {projector[0]} × {projector[1]} px{source}"
+
+
+def _covariance(rig: Rig) -> Iterator[Finding]:
+    fault = covariance_fault(rig)
+    if fault is not None:
+        yield Finding("rig", "covariance", Verdict.WARNING, fault)
 
 
 def _sizes(rig: Rig, settings: Any) -> Iterator[Finding]:

@@ -125,9 +125,10 @@ def test_limits_that_allow_nothing_are_refused():
 
 
 def test_boards_are_photographed_at_one_exposure_whatever_scans_take():
-    scan = ScanSection(exposures=(1.0, 0.25))
+    scan = ScanSection(exposures=(1.0, 0.25), max_regional_sequences=4)
     work = SimpleNamespace(
         loaded=SimpleNamespace(config=SimpleNamespace(scan=scan)),
         settings=SimpleNamespace(geometry=SimpleNamespace(steps=8)),
     )
-    assert fringes(work, (640, 400)).exposures == (1.0,)
+    board = fringes(work, (640, 400))
+    assert (board.method, board.exposures, board.max_regional_sequences) == ("tps", (1.0,), 1)

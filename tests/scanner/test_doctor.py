@@ -247,6 +247,28 @@ def test_a_simulated_bench_is_ready(tmp_path):
     assert "432 frames of 256 × 192 px" in space  # two rounds of 9 frequencies, 2 axes, 12 steps
 
 
+def test_room_for_every_regional_sequence_at_every_exposure(tmp_path):
+    scan = "scan: {exposures: [1, 0.25], max_regional_sequences: 3}\n"
+    loaded = configuration(tmp_path, SIMULATED + scan)
+    # Round one and three regional ones, of 9 frequencies, 2 axes and 12 steps each, at two exposures.
+    frames = (1 + 3) * 9 * 2 * 12 * 2
+    for free, verdict in ((1.19, Verdict.FAULT), (1.21, Verdict.OK)):
+        found = list(judge(loaded, machine(free_bytes=int(free * frames * 256 * 192)), None))
+        assert verdicts(found)["disk", "space"] is verdict
+        assert any(f"{frames} frames of 256 × 192 px" in f.text for f in found)
+
+
+def test_a_covariance_of_another_program_is_a_warning(tmp_path):
+    from scanner.rig import Rig
+
+    own = configuration(tmp_path, SIMULATED).bench_settings.rig()
+    metadata = {"calibration": {"parameters": ["tripod.height"], "covariance": [[1.0]]}}
+    Rig(own.camera, own.projector, own.rotation, own.translation, metadata).save(tmp_path / "rig.json")
+    found = list(judge(configuration(tmp_path, SIMULATED + "rig: rig.json\n"), HEALTHY, None))
+    assert verdicts(found)["rig", "covariance"] is Verdict.WARNING
+    assert not [f for f in found if f.verdict is Verdict.FAULT]
+
+
 def test_the_rig_of_another_camera_is_a_fault(tmp_path):
     from sim_backend.settings import SimulatedSettings
 

@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 from graded import DARK, ELECTRONS, EXPOSURES, GLINT, GLOSSY, MATT, OWN_S, READ, graded_bench, job_of, run, zone
 
-from scanner.config import GatesSection
+from drivers import NoiseModel
+from scanner.config import GatesSection, ScanSection
+from scanner.decoding import Decoder
 from scanner.exposures import read_plan
 from scanner.methods import METHODS
 from scanner.processing import process_take
 from scanner.quality import exposures_said
 from scanner.result import Flag
-from scanner.take import Take
+from scanner.take import Take, TakeError
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +167,7 @@ def test_two_rounds_fuse_each_and_the_bounce_goes(array_bench, tmp_path):
 def test_a_dark_round_does_not_lower_the_noise(array_bench, tmp_path):
     # Round two lights little of the picture; its σ is that of the light there, as round one has measured it.
     bench = graded_bench(alpha=np.zeros_like(array_bench().alpha), seed=14)
-    bench.alpha[50:64][zone(bench, MATT)[50:64]] = 0.5
+    bench.alpha[54:62, 62:70] = 0.5
     job = job_of(bench, tmp_path, "mfs", steps=4, exposures=(1.0, 0.5))
     noises = []
     at = job.decoder.noise_at
@@ -174,6 +176,50 @@ def test_a_dark_round_does_not_lower_the_noise(array_bench, tmp_path):
     assert [exposure for exposure, _ in noises] == [0, 1, 0, 1]
     for exposure, noise in noises:
         assert noise.variance(120.0) == pytest.approx(READ**2 + 1 / 12 + 120 * ELECTRONS, rel=0.25), exposure
+
+
+def test_an_exposure_that_round_one_lacks_has_round_ones_noise_in_round_two(array_bench, tmp_path, monkeypatch):
+    bench = graded_bench(alpha=np.zeros_like(array_bench().alpha), seed=15)
+    bench.alpha[54:62, 62:70] = 0.5
+    job = job_of(bench, tmp_path, "mfs", steps=4, exposures=(1.0, 0.5))
+    run(job)
+    take, noises = Take.open(job.take.path), []
+    frames, at = Take.frames, Decoder.noise_at
+
+    def without_one(self, number, sequence, *, verify=True):
+        if (number, sequence) == (1, len(self.sequences(1)) // 2):
+            raise TakeError("damaged", "")
+        return frames(self, number, sequence, verify=verify)
+
+    def noted(self, exposure, collected):
+        noises.append((exposure, at(self, exposure, collected)))
+        return noises[-1][1]
+
+    monkeypatch.setattr(Take, "frames", without_one)
+    monkeypatch.setattr(Decoder, "noise_at", noted)
+    process_take(take, job.scan, GatesSection(), None)
+    assert [exposure for exposure, _ in noises] == [0, 0, 1]  # round one at one exposure, round two at both
+    assert noises[0][1] == noises[1][1] == noises[2][1]
+    assert noises[0][1].variance(120.0) == pytest.approx(READ**2 + 1 / 12 + 120 * ELECTRONS, rel=0.25)
+
+
+def test_noise_is_warned_of_once_whatever_the_ratio():
+    class Frames:
+        def __init__(self, read_dn):
+            self.found = None if read_dn is None else NoiseModel(read_dn)
+
+        def estimate_noise(self):
+            return self.found
+
+    decoder = Decoder(METHODS["tps"], ScanSection(), NoiseModel(1.0), None)
+    for exposure, read_dn in enumerate((2.0, 3.0, 4.0)):
+        assert decoder.noise_at(exposure, Frames(read_dn)).read_dn == read_dn
+    assert len(decoder.warnings) == 1
+    assert "2.0 × as noisy" in decoder.warnings[0]
+    unknown = Decoder(METHODS["tps"], ScanSection(), None, None)
+    for exposure in range(3):
+        unknown.noise_at(exposure, Frames(None))
+    assert len(unknown.warnings) == 1
 
 
 def test_newer_takes_are_told_from_older_ones(fused):

@@ -4,9 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
+from drivers import NoiseModel
 from scanner import optics
+from scanner.config import ScanSection
+from scanner.decoding import Decoder
+from scanner.methods import METHODS
 from scanner.rig import Lens, Rig, RigError
-from scanner.rig_uncertainty import along_rays, check_covariance, sigma_rig
+from scanner.rig_uncertainty import along_rays, covariance_fault, sigma_rig
 from scanner.triangulation import triangulate
 
 SIZE = (64, 48)
@@ -132,8 +136,8 @@ def test_a_rig_that_states_no_covariance_has_no_sigma():
     assert sigma_rig(_rig(metadata={"calibration": {"rms": 0.1}}), depth, maps[1], maps[3]) is None
 
 
-@pytest.mark.parametrize("fault", ["short", "words", "nan", "foreign"])
-def test_a_covariance_that_fits_no_rig_is_refused(fault):
+@pytest.mark.parametrize("fault", ["short", "words", "nan", "foreign", "twice", "number", "numbers"])
+def test_a_covariance_of_another_program_is_left_out_and_said_so_before_a_scan(fault):
     covariance, names = _covariance(), list(NAMES)
     document = {"parameters": names, "covariance": covariance.tolist()}
     if fault == "short":
@@ -143,11 +147,27 @@ def test_a_covariance_that_fits_no_rig_is_refused(fault):
     elif fault == "nan":
         document["covariance"][0][0] = float("nan")
     else:
-        document["parameters"] = [*names[:-1], "tripod.height"]
+        document["parameters"] = {
+            "foreign": [*names[:-1], "tripod.height"],
+            "twice": [names[0], *names[:-1]],
+            "number": len(names),
+            "numbers": list(range(len(names))),
+        }[fault]
     depth, maps = _scene()
     rig = _rig(metadata={"calibration": document})
-    with pytest.raises(RigError, match="covariance"):
-        sigma_rig(rig, depth, maps[1], maps[3])
-    # And before a scan.
-    with pytest.raises(RigError, match="covariance"):
-        check_covariance(rig)
+    assert sigma_rig(rig, depth, maps[1], maps[3]) is None
+    said = covariance_fault(rig)
+    assert "covariance" in said
+    assert "without sigma_rig" in said
+    assert Decoder(METHODS["tps"], ScanSection(), NoiseModel(1.0), rig).warnings == [said]
+
+
+def test_nothing_is_said_of_a_rig_whose_covariance_is_used_or_that_has_none():
+    for rig in (_stating(_covariance()), _rig(), _rig(metadata={"calibration": {"rms": 0.1}})):
+        assert covariance_fault(rig) is None
+        assert Decoder(METHODS["tps"], ScanSection(), NoiseModel(1.0), rig).warnings == []
+
+
+def test_parameters_that_no_rig_has_are_refused():
+    with pytest.raises(RigError, match=r"tripod\.height"):
+        along_rays(_rig(), ["tripod.height"], np.eye(1), np.zeros((1, 2)), np.array([500.0]), np.ones(2))

@@ -7,9 +7,10 @@ import json
 import pytest
 
 from drivers import DeviceSettingError, HardwareError
+from scanner.acquisition import Silence
 from scanner.config import load_config
 from scanner.rig import Rig
-from scanner.session import latency_of, measure_latency
+from scanner.session import latency_of, measure_latency, run_scan
 
 LATENCY_S, REFRESH_HZ = 0.035, 60
 
@@ -21,6 +22,20 @@ bench:
   projector: {width_px: 160, height_px: 100, latency_s: 0.035, refresh_hz: 60}
   transport: {photons: 1000, supersample: 1}
 """
+
+
+class Notes(Silence):
+    """Keeps what the operator reads, in the order of the first frame and the notes."""
+
+    def __init__(self):
+        self.said = []
+
+    def note(self, text):
+        self.said.append(text)
+
+    def frame(self, progress):
+        if "frame" not in self.said:
+            self.said.append("frame")
 
 
 def silent(done, total):
@@ -72,3 +87,20 @@ def test_bench_that_knows_when_a_pattern_is_on_needs_no_latency(array_bench, mon
     monkeypatch.setattr(session, "open_bench", lambda loaded: nullcontext(array_bench()))
     with pytest.raises(HardwareError, match="knows by itself"):
         measure_latency(None, silent)
+
+
+def test_the_rig_of_another_program_scans_and_what_it_lacks_is_said_first(transport_cache, tmp_path):
+    config = tmp_path / "bench.yaml"
+    scan = "scan: {method: tps, steps: 4, axes: [x]}\noutput: {report: false, keep_take: false}\nrig: rig.json\n"
+    config.write_text(BENCH)
+    rig = load_config(config).config.bench.settings.rig()
+    metadata = {"calibration": {"parameters": ["tripod.height"], "covariance": [[1.0]]}}
+    Rig(rig.camera, rig.projector, rig.rotation, rig.translation, metadata).save(tmp_path / "rig.json")
+    config.write_text(BENCH.replace("camera:", "settle_s: 0.2\n  camera:", 1) + scan)
+    notes = Notes()
+    result, _ = run_scan(load_config(config), tmp_path / "out", False, notes)
+    (said,) = (w for w in result.warnings if "sigma_rig" in w)
+    assert "tripod.height" in said
+    assert notes.said.index(said) < notes.said.index("frame")
+    assert result.maps.sigma_rig is None
+    assert result.maps.valid.any()
