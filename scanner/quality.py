@@ -107,7 +107,10 @@ def summarise(
             "share of the modulated pixels whose fringes fit no model",
         ),
     ]
-    excess = excess_misfit(maps.misfit * np.float32(maps.misfit_dof), max(maps.misfit_dof, 1), modulated)
+    # What a regional sequence has measured is judged by its own fringes.
+    last = maps.misfit if maps.misfit_round2 is None else maps.misfit_round2
+    misfit = np.where(np.isfinite(last), last, maps.misfit)
+    excess = excess_misfit(misfit * np.float32(maps.misfit_dof), max(maps.misfit_dof, 1), modulated)
     judged.append(
         _gate(
             "max_excess_misfit",

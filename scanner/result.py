@@ -39,6 +39,10 @@ class Flag(IntFlag):
     """The recording ended before this pixel could be decided."""
     THIRD_PATH = 2048
     """Round one shows more than two light paths here: neither one nor two fit its fringes."""
+    RIPPLE = 4096
+    """A weak bounce that only the neighbourhood shows was taken off the coordinate."""
+    STRAY = 8192
+    """The coordinate was refused: hardly any neighbour goes on with it."""
 
 
 @dataclass(frozen=True)

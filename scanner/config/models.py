@@ -221,6 +221,11 @@ class ScanSection(_Section):
         "neighbours, which sees bounces below the noise of a pixel; variation: the paper's standard deviation of the "
         "modulation over the frequencies, which sees less.",
     )
+    remove_ripples: bool = Field(
+        True,
+        description="Take bounces that are too weak for a pixel off the coordinates of mfs and mfs1, where they draw "
+        "ripples on a smooth surface; what the surface itself does stays. false: leave them in.",
+    )
     regional_rule: Literal["sound", "literal"] = Field(
         "sound",
         description="What round two lights. sound: only where direct light of the detected pixels can come from; "

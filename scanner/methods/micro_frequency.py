@@ -54,6 +54,8 @@ from scanner.phasors import RoundPhasors
 from scanner.pooling import one_path_residuals
 from scanner.regions import literal_mask
 from scanner.result import Flag, Maps
+from scanner.ripples import remove_ripples, shift_of
+from scanner.strays import strays
 
 FREQUENCIES = 9
 """T: frequencies an axis; t = 0..8."""
@@ -120,20 +122,28 @@ class MicroFrequencyShifting:
             detection = detect(statistic, dof, coordinates, usable, setup.scan.false_alarm_rate)
         refused = detection.region | detection.depth_edge | detection.suspicious
         clean = usable & maps.valid & ~refused
+        seen = usable & ~detection.region & ~detection.depth_edge
+        decoded, rippled = _without_ripples(frames, decoded, seen, clean, setup)
         separated = separate_region(frames, decoded, detection, clean, setup)
         flags = first_flags(usable, frames.saturated, [u for u in (maps.x_p, maps.y_p) if u is not None])
         flags[detection.region] |= np.uint16(Flag.INTERREFLECTION)
         flags[detection.depth_edge] |= np.uint16(Flag.DEPTH_EDGE)
         flags[detection.suspicious] |= np.uint16(Flag.MISFIT)
-        known = {
-            a: (u, s) for a, u, s in (("x", maps.x_p, maps.sigma_x), ("y", maps.y_p, maps.sigma_y)) if u is not None
+        flags[rippled] |= np.uint16(Flag.RIPPLE)
+        planes: tuple[tuple[Axis, NDArray[np.float32] | None, NDArray[np.float32] | None], ...] = (
+            ("x", maps.x_p, maps.sigma_x),
+            ("y", maps.y_p, maps.sigma_y),
+        )
+        known: dict[Axis, tuple[NDArray[np.float32], NDArray[np.float32]]] = {
+            a: (np.where(rippled, decoded[a].coordinates.u, u), np.where(rippled, decoded[a].coordinates.sigma, s))
+            for a, u, s in planes
+            if u is not None and s is not None
         }
         results: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
         for axis, (u, sigma) in known.items():
-            u, sigma = u.copy(), sigma.copy()  # type: ignore[union-attr]
             u[refused] = sigma[refused] = np.nan
-            _put(u, separated, separated.u[axis])  # type: ignore[index]
-            _put(sigma, separated, separated.sigma[axis])  # type: ignore[index]
+            _put(u, separated, separated.u[axis])
+            _put(sigma, separated, separated.sigma[axis])
             results[axis] = (u, sigma)
         flags.reshape(-1)[separated.pixels[separated.trusted]] |= np.uint16(Flag.SEPARATED)
         for flag, which in ((Flag.THIRD_PATH, separated.third), (Flag.OFF_EPIPOLAR, separated.off_line)):
@@ -158,7 +168,7 @@ class MicroFrequencyShifting:
         evidence = weigh(separated, frames.plan.size)
         regional = self._begun(first, separated, detection, evidence, frames.plan, setup.scan)
         return FirstRound(
-            refuse_off_epipolar(first, setup.rig),
+            _finished(first, setup),
             frames.plan,
             _Private(decoded, detection, separated, regional),
             regional=max(regional.planned, 1),
@@ -218,8 +228,12 @@ class MicroFrequencyShifting:
         decoded = decode_axes(regional, setup, {a: d.gain for a, d in private.decoded.items()})
         if set(decoded) != set(private.decoded):
             return replace(first, maps=replace(first.maps, lit=state.lit > 0), private=replace(private, regional=state))
-        total, dof = misfit_statistic([d.coordinates for d in decoded.values()])
         found, usable = one_path_maps(regional, decoded, setup)
+        whole = usable & lit_here(lit, found.x_p, found.y_p)
+        decoded, rippled = _without_ripples(regional, decoded, whole, whole, setup)
+        if rippled.any():
+            found, _ = one_path_maps(regional, decoded, setup)
+        total, dof = misfit_statistic([d.coordinates for d in decoded.values()])
         only = state.planned == 1
         if not only:
             found = refuse_off_epipolar(found, setup.rig)
@@ -255,8 +269,15 @@ class MicroFrequencyShifting:
         flags[region & regional.saturated] |= np.uint16(Flag.SATURATED)
         flags[passed] |= np.uint16(Flag.SECOND_ROUND)
         flags[passed] &= ~np.uint16(
-            Flag.SEPARATED | Flag.MISFIT | Flag.NOT_LIT | Flag.OFF_EPIPOLAR | Flag.OUT_OF_VOLUME
+            Flag.SEPARATED
+            | Flag.MISFIT
+            | Flag.NOT_LIT
+            | Flag.OFF_EPIPOLAR
+            | Flag.OUT_OF_VOLUME
+            | Flag.RIPPLE
+            | Flag.STRAY
         )
+        flags[passed & rippled] |= np.uint16(Flag.RIPPLE)
         one = first.maps
 
         def merged(old: NDArray[np.float32] | None, new: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
@@ -283,7 +304,7 @@ class MicroFrequencyShifting:
                 state = again(state, region, private.separated, first.plan.size, setup.scan.lit_margin_px)
         joined = replace(
             first,
-            maps=refuse_off_epipolar(fused, setup.rig),
+            maps=_finished(fused, setup),
             private=replace(private, regional=state),
             regional=max(state.planned, 1),
             notes=[],
@@ -359,6 +380,45 @@ def _detect_pooled(
         one_path_residuals(phasors_of(frames, a), d.coordinates, d.sigma_z, d.gain, usable) for a, d in decoded.items()
     ]
     return detect_pooled(residuals, statistic, dof, coordinates, usable, setup.scan.false_alarm_rate)
+
+
+def _finished(maps: Maps, setup: Setup) -> Maps:
+    """Points, without strays and without coordinates off their epipolar line."""
+    lost = strays(maps.x_p, maps.y_p)
+    nan = np.float32(np.nan)
+    x, y, sigma_x, sigma_y = (
+        None if u is None else np.where(lost, nan, u) for u in (maps.x_p, maps.y_p, maps.sigma_x, maps.sigma_y)
+    )
+    flags = np.where(lost, maps.flags | np.uint16(Flag.STRAY), maps.flags)
+    return refuse_off_epipolar(replace(maps, x_p=x, y_p=y, sigma_x=sigma_x, sigma_y=sigma_y, flags=flags), setup.rig)
+
+
+def _without_ripples(
+    frames: RoundPhasors,
+    decoded: dict[Axis, DecodedAxis],
+    good: NDArray[np.bool_],
+    asked: NDArray[np.bool_],
+    setup: Setup,
+) -> tuple[dict[Axis, DecodedAxis], NDArray[np.bool_]]:
+    """Take the bounces that only neighbours show off the ``asked`` pixels, and off their phasors."""
+    if not setup.scan.remove_ripples:
+        return decoded, np.zeros(good.shape, bool)
+    smooth: dict[Axis, DecodedAxis] = {}
+    ripples: dict[Axis, NDArray[np.float32]] = {}
+    for axis, d in decoded.items():
+        extent = frames.plan.extent(axis)
+        coordinates, ripples[axis] = remove_ripples(
+            phasors_of(frames, axis), d.coordinates, d.sigma_z, d.gain, good, asked, extent
+        )
+        smooth[axis] = replace(d, coordinates=coordinates)
+    if len(ripples) == 2:
+        for axis, other in (AXES, AXES[::-1]):
+            # Both axes see the same bounce: what one shows and the other does not is still in the other's coordinate.
+            hidden = np.maximum(ripples[other] - ripples[axis], 0)
+            c = smooth[axis].coordinates
+            sigma = np.hypot(c.sigma, shift_of(hidden, phasors_of(frames, axis).frequency))
+            smooth[axis] = replace(smooth[axis], coordinates=replace(c, sigma=sigma))
+    return smooth, np.asarray(np.maximum.reduce(list(ripples.values())) > 0)
 
 
 def _put(plane: NDArray[np.float32], separated: Separated, values: NDArray[np.float32]) -> None:
