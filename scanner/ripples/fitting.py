@@ -46,6 +46,9 @@ _ROUGH_PX = 0.5
 _STRAY_PX = 1.0
 """Cells farther off than this, and than four times the usual, do not count."""
 
+_SETTLING = 2
+"""Rounds in which surface and waves are fitted in turns."""
+
 
 @compiled
 def _carriers(turns, ratio, lines):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
@@ -130,6 +133,94 @@ def _place(v, frequency, gain, middle, reach):  # type: ignore[no-untyped-def]  
 
 
 @compiled
+def _smooth(u, good, each, weights, coefficients, values, off):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Fit the surface without strays; sets the weights, returns by how much it is usually missed, px."""
+    for n in range(u.size):
+        weights[n] = 1.0 if good[n] else 0.0
+    usual = 0.0
+    for _ in range(3):
+        fit_surface(u, weights, each, coefficients)
+        values_of(coefficients, each, values)
+        m = 0
+        for n in range(u.size):
+            if good[n]:
+                off[m] = abs(u[n] - values[n])
+                m += 1
+        usual = 1.4826 * np.median(off[:m])
+        for n in range(u.size):
+            weights[n] = 1.0 if good[n] and abs(u[n] - values[n]) < max(4 * usual, _STRAY_PX) else 0.0
+    fit_surface(u, weights, each, coefficients)
+    values_of(coefficients, each, values)
+    return usual
+
+
+@compiled
+def _rest(z, frequency, gain, place, level, weights, found, v, down, across, rest):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """What surface and waves leave of the phasors, turned back by the surface."""
+    for t in range(frequency.size):
+        for n in range(place.size):
+            if weights[n] == 0:
+                rest[t, n] = 0
+                continue
+            s, c = sin_cos_turns(np.float32(frequency[t] * place[n]))
+            left = z[t, n] * complex(c, -s) - gain[t] * level[n]
+            for w in range(found):
+                left -= v[w, t] * down[w, t, n // WINDOW] * across[w, t, n % WINDOW]
+            rest[t, n] = left
+
+
+@compiled
+def _settle(frequency, gain, each, weights, total, found, v, down, across, rest, du, off, cu, cb, change, level):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Fit the waves anew to what is left, then the surface to what these leave: one round of backfitting."""
+    trial = np.empty(frequency.size, np.complex128)
+    for w in range(found):
+        _amplitudes(rest, down[w], across[w], total, trial)
+        for t in range(frequency.size):
+            v[w, t] += trial[t]
+            for n in range(weights.size):
+                if weights[n] > 0:
+                    rest[t, n] -= trial[t] * down[w, t, n // WINDOW] * across[w, t, n % WINDOW]
+    gg = (gain**2).sum()
+    ffgg = ((frequency * gain) ** 2).sum()
+    for n in range(weights.size):
+        du[n], off[n] = 0.0, 0.0
+        if weights[n] > 0:
+            slope, more = 0.0, 0.0
+            for t in range(frequency.size):
+                slope += frequency[t] * gain[t] * rest[t, n].imag
+                more += gain[t] * rest[t, n].real
+            du[n] = slope / (2 * np.pi * level[n] * ffgg)
+            off[n] = more / gg
+    fit_surface(du, weights, each, change)
+    for a in range(TERMS):
+        cu[a] += change[a]
+    fit_surface(off, weights, each, change)
+    for a in range(TERMS):
+        cb[a] += change[a]
+
+
+@compiled
+def _sharpened(rest, ratio, total, ky, kx, down, across, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Spatial frequency between the steps, with the ratio of the plan's frequencies; its carriers and amplitudes."""
+    trial = np.empty(ratio.size, np.complex128)
+    best, step = -1.0, 0.5 / FINENESS
+    for _ in range(2):
+        middle_y, middle_x = ky, kx
+        for a in range(-1, 2):
+            _carriers(middle_y + a * step, ratio, down)
+            for b in range(-1, 2):
+                _carriers(middle_x + b * step, ratio, across)
+                strength = _amplitudes(rest, down, across, total, trial)
+                if strength > best:
+                    best, ky, kx = strength, middle_y + a * step, middle_x + b * step
+                    out[:] = trial
+        step /= 2
+    _carriers(ky, ratio, down)
+    _carriers(kx, ratio, across)
+    return best, ky, kx
+
+
+@compiled
 def fit_windows(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     z,
     u,
@@ -152,146 +243,86 @@ def fit_windows(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     start,
     stop,
 ):
-    """Fit surface and ripples of the windows in rows start..stop of windows; see `scanner.ripples`."""
-    count = frequency.size
-    size = WINDOW * WINDOW
+    """Surface and waves of the windows in rows start..stop of windows, as `scanner.ripples.removal` lays them out."""
+    count, size = frequency.size, WINDOW * WINDOW
     middle = frequency.mean()
     ratio = (frequency / middle).astype(np.float32)
+    gg = (gain**2).sum()
     each = np.empty((size, TERMS))
-    for i in range(size):
-        terms(np.float32(i // WINDOW), np.float32(i % WINDOW), each[i])
-    weights, us, bs = np.empty(size), np.empty(size), np.empty(size)
+    for n in range(size):
+        terms(np.float32(n // WINDOW), np.float32(n % WINDOW), each[n])
+    weights, place, level = np.empty(size), np.empty(size), np.empty(size)
     uu, aa, off, du = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
     cu, cb, change = np.empty(TERMS), np.empty(TERMS), np.empty(TERMS)
-    e, rest = np.empty((count, size), np.complex64), np.empty((count, size), np.complex64)
+    here, there = np.empty(size, np.bool_), np.empty((count, size), np.complex64)
+    rest = np.empty((count, size), np.complex64)
     down = np.empty((MOST_WAVES, count, WINDOW), np.complex64)
     across = np.empty((MOST_WAVES, count, WINDOW), np.complex64)
-    trial_down, trial_across = np.empty((count, WINDOW), np.complex64), np.empty((count, WINDOW), np.complex64)
-    v, trial = np.empty((MOST_WAVES, count), np.complex128), np.empty(count, np.complex128)
-    gg, ffgg = 0.0, 0.0
-    for t in range(count):
-        gg += gain[t] ** 2
-        ffgg += (frequency[t] * gain[t]) ** 2
+    v = np.empty((MOST_WAVES, count), np.complex128)
     for i in range(start, stop):
         for j in range(columns.size):
-            y0, x0 = rows[i], columns[j]
-            total, here, noise = 0, False, 0.0
+            total, wanted, noise = 0, False, 0.0
             for n in range(size):
-                y, x = y0 + n // WINDOW, x0 + n % WINDOW
-                weights[n] = 1.0 if good[y, x] else 0.0
-                if good[y, x]:
+                y, x = rows[i] + n // WINDOW, columns[j] + n % WINDOW
+                here[n] = good[y, x]
+                uu[n] = u[y, x] if here[n] else 0.0
+                aa[n] = amplitude[y, x] if here[n] else 0.0
+                if here[n]:
                     total += 1
-                    uu[n], aa[n] = u[y, x], amplitude[y, x]
                     noise += sigma[y, x] ** 2
-                    here |= asked[y, x]
-                else:
-                    uu[n], aa[n] = 0.0, 0.0
-            if not here or total < _FEWEST * size:
+                    wanted |= asked[y, x]
+            if not wanted or total < _FEWEST * size:
                 continue
             noise /= total
-            # The smooth surface, without strays.
-            for _ in range(3):
-                fit_surface(uu, weights, each, cu)
-                values_of(cu, each, us)
-                m = 0
-                for n in range(size):
-                    if good[y0 + n // WINDOW, x0 + n % WINDOW]:
-                        off[m] = abs(uu[n] - us[n])
-                        m += 1
-                usual = 1.4826 * np.median(off[:m])
-                limit = max(4 * usual, _STRAY_PX)
-                for n in range(size):
-                    there = good[y0 + n // WINDOW, x0 + n % WINDOW]
-                    weights[n] = 1.0 if there and abs(uu[n] - us[n]) < limit else 0.0
+            usual = _smooth(uu, here, each, weights, cu, place, off)
             total = int(weights.sum())
             if usual > _ROUGH_PX or total < _FEWEST * size:
                 continue
-            fit_surface(uu, weights, each, cu)
-            values_of(cu, each, us)
             fit_surface(aa, weights, each, cb)
-            values_of(cb, each, bs)
+            values_of(cb, each, level)
             tapered = 0.0
             for n in range(size):
                 tapered += weights[n] * taper[n // WINDOW, n % WINDOW] ** 2
+                for t in range(count):
+                    there[t, n] = z[t, rows[i] + n // WINDOW, columns[j] + n % WINDOW]
             found = 0
             while True:
-                # What surface and waves so far leave; the surface is fitted anew without the waves.
-                for turn in range(3):
-                    for t in range(count):
-                        for n in range(size):
-                            if weights[n] == 0:
-                                e[t, n] = 0
-                                continue
-                            s, c = sin_cos_turns(np.float32(frequency[t] * us[n]))
-                            value = z[t, y0 + n // WINDOW, x0 + n % WINDOW]
-                            e[t, n] = value * complex(c, -s) - gain[t] * bs[n]
-                    for t in range(count):
-                        for n in range(size):
-                            rest[t, n] = e[t, n]
-                    for w in range(found):
-                        for t in range(count):
-                            for n in range(size):
-                                if weights[n] > 0:
-                                    rest[t, n] -= v[w, t] * down[w, t, n // WINDOW] * across[w, t, n % WINDOW]
-                    if turn == 2:
-                        break
-                    for w in range(found):
-                        _amplitudes(rest, down[w], across[w], total, trial)
-                        for t in range(count):
-                            for n in range(size):
-                                if weights[n] > 0:
-                                    rest[t, n] -= trial[t] * down[w, t, n // WINDOW] * across[w, t, n % WINDOW]
-                            v[w, t] += trial[t]
-                    for n in range(size):
-                        du[n], off[n] = 0.0, 0.0
-                        if weights[n] > 0:
-                            slope, level = 0.0, 0.0
-                            for t in range(count):
-                                slope += frequency[t] * gain[t] * rest[t, n].imag
-                                level += gain[t] * rest[t, n].real
-                            du[n] = slope / (2 * np.pi * bs[n] * ffgg)
-                            off[n] = level / gg
-                    fit_surface(du, weights, each, change)
-                    for a in range(TERMS):
-                        cu[a] += change[a]
-                    fit_surface(off, weights, each, change)
-                    for a in range(TERMS):
-                        cb[a] += change[a]
-                    values_of(cu, each, us)
-                    values_of(cb, each, bs)
+                for _ in range(_SETTLING):
+                    _rest(there, frequency, gain, place, level, weights, found, v, down, across, rest)
+                    _settle(
+                        frequency,
+                        gain,
+                        each,
+                        weights,
+                        total,
+                        found,
+                        v,
+                        down,
+                        across,
+                        rest,
+                        du,
+                        off,
+                        cu,
+                        cb,
+                        change,
+                        level,
+                    )
+                    values_of(cu, each, place)
+                    values_of(cb, each, level)
                 if found == MOST_WAVES:
                     break
+                _rest(there, frequency, gain, place, level, weights, found, v, down, across, rest)
                 power, ky, kx = _strongest(rest, weights, taper, table, groups)
                 if power < _LEAST_POWER * noise * tapered * count / GROUPS:
                     break
-                # Between the steps, and with the ratio of the plan's frequencies.
-                best, step = -1.0, 0.5 / FINENESS
-                for _ in range(2):
-                    middle_y, middle_x = ky, kx
-                    for a in range(-1, 2):
-                        _carriers(middle_y + a * step, ratio, trial_down)
-                        for b in range(-1, 2):
-                            _carriers(middle_x + b * step, ratio, trial_across)
-                            strength = _amplitudes(rest, trial_down, trial_across, total, trial)
-                            if strength > best:
-                                best, ky, kx = strength, middle_y + a * step, middle_x + b * step
-                                v[found] = trial
-                    step /= 2
-                _carriers(ky, ratio, down[found])
-                _carriers(kx, ratio, across[found])
+                power, ky, kx = _sharpened(rest, ratio, total, ky, kx, down[found], across[found], v[found])
                 at, explained, none = _place(v[found], frequency, gain, middle, reach)
-                lead = (explained - none) * total / noise
-                if (
-                    abs(at) < _NEAREST_PX
-                    or lead < _LEAST_LEAD
-                    or explained < _CLEAREST_SHARE * best
-                    or explained < gg * (_LEAST_RATIO * cb[0]) ** 2
-                ):
+                if abs(at) < _NEAREST_PX or (explained - none) * total < _LEAST_LEAD * noise:
+                    break
+                if explained < _CLEAREST_SHARE * power or explained < gg * (_LEAST_RATIO * cb[0]) ** 2:
                     break
                 turns[i, j, found, 0], turns[i, j, found, 1] = ky, kx
                 found += 1
             known[i, j] = 1 + found
             surface[i, j] = cu
-            for w in range(found):
-                for t in range(count):
-                    vectors[i, j, w, t] = v[w, t]
+            vectors[i, j, :found] = v[:found]

@@ -65,7 +65,7 @@ def test_a_part_brighter_by_its_bounce_is_given_a_second_round(scan_simulated):
         stronger = (truth.alpha > 1) & np.isfinite(truth.x_p) & ~truth.edge
     assert stronger.sum() > 500
     assert maps.lit is not None
-    flagged = (maps.flags & (Flag.THIRD_PATH | Flag.MISFIT | Flag.OFF_EPIPOLAR | Flag.NOT_LIT)) != 0
+    flagged = (maps.flags & (Flag.THIRD_PATH | Flag.MISFIT | Flag.OFF_EPIPOLAR | Flag.NOT_LIT | Flag.STRAY)) != 0
     assert (flagged | np.isfinite(maps.x_p))[stronger & maps.interreflection].all()
     assert ((maps.flags & Flag.THIRD_PATH) != 0)[stronger].mean() > 0.2
     # The bounce is not returned for the direct light, though it is the brighter of the two.
