@@ -278,10 +278,15 @@ class MicroFrequencyShifting:
             | Flag.STRAY
         )
         flags[passed & rippled] |= np.uint16(Flag.RIPPLE)
+        # With fewer bounces than round one, the sequence still sees one: round one's coordinate cannot stand either.
+        refuted = target & ~region & usable & here & ~fits & (state.sequence == 0)
+        flags[refuted] |= np.uint16(Flag.MISFIT)
         one = first.maps
 
         def merged(old: NDArray[np.float32] | None, new: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
-            return None if old is None or new is None else np.where(passed, new, old)
+            if old is None or new is None:
+                return None
+            return np.where(passed, new, np.where(refuted, np.float32(np.nan), old))
 
         tested = target & usable & (passed | (state.sequence == 0))
         old = np.float32(np.nan) if one.misfit_round2 is None else one.misfit_round2
