@@ -287,7 +287,7 @@ def fit_windows(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
                     there[t, n] = z[t, rows[i] + n // WINDOW, columns[j] + n % WINDOW]
             found = 0
             while True:
-                for _ in range(_SETTLING):
+                for _ in range(_SETTLING if found else 1):
                     _rest(there, frequency, gain, place, level, weights, found, v, down, across, rest)
                     _settle(
                         frequency,

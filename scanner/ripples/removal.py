@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -75,6 +76,8 @@ def remove_ripples(
         places = windows.rows, windows.columns, windows.row_range, windows.column_range
         what = phasors.z, sigma_z, asked, frequency, gain, binning, *places, *found
         _everywhere(what, (now.u, now.amplitude, now.chi2, ripple))
+        near = np.ones((2 * STRIDE * binning + 1,) * 2, np.uint8)
+        asked = asked & (cv2.dilate((ripple > 0).astype(np.uint8), near) > 0)
     stayed = np.float32(_LEFT) * shift_of(ripple, frequency)
     return replace(now, sigma=np.hypot(now.sigma, stayed)), ripple
 
@@ -114,19 +117,61 @@ def _cells(
     """Means over blocks of pixels, so that a window spans as many fringes whatever the camera resolves."""
     if binning == 1:
         return z, now.u, now.amplitude, sigma_z, good, asked
-    height, width = (n // binning for n in good.shape)
+    shape = tuple(n // binning for n in good.shape)
+    planes = [now.u, now.amplitude, sigma_z**2]
+    means: list[NDArray[np.float32]] = [np.empty(shape, np.float32) for _ in planes]
+    z_mean: NDArray[np.complex64] = np.empty((len(z), *shape), np.complex64)
+    whole: NDArray[np.bool_] = np.empty(shape, bool)
+    wanted: NDArray[np.bool_] = np.zeros(shape, bool)
 
-    def blocks(plane: NDArray[Any]) -> Any:
-        cut = plane[: height * binning, : width * binning]
-        return cut.reshape(height, binning, width, binning)
+    def rows(start: int, stop: int) -> None:
+        _block_means(z, *planes, good, asked, binning, z_mean, *means, whole, wanted, start, stop)  # type: ignore[call-arg]
 
-    def mean(plane: NDArray[Any]) -> Any:
-        return np.asarray(blocks(plane).mean(axis=(1, 3)), plane.dtype)
+    over_rows(rows, shape[0])
+    noise = np.asarray(np.sqrt(means[2]) / np.float32(binning), np.float32)
+    return z_mean, means[0], means[1], noise, whole, wanted
 
-    whole = blocks(good).all(axis=(1, 3))
-    u, amplitude = (mean(np.where(good, p, np.float32(0))) for p in (now.u, now.amplitude))
-    noise = np.sqrt(mean(sigma_z**2)) / np.float32(binning)
-    return np.stack([mean(p) for p in z]), u, amplitude, noise, whole, blocks(asked).any(axis=(1, 3))
+
+@compiled
+def _block_means(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    z,
+    u,
+    amplitude,
+    variance,
+    good,
+    asked,
+    side,
+    z_mean,
+    u_mean,
+    amplitude_mean,
+    variance_mean,
+    whole,
+    wanted,
+    start,
+    stop,
+):
+    """Means of the blocks in rows start..stop of blocks; a block with a pixel that is not good is not whole."""
+    share = np.float32(1 / side**2)
+    for i in range(start, stop):
+        for j in range(whole.shape[1]):
+            all_good = True
+            first, second, third = np.float32(0), np.float32(0), np.float32(0)
+            for y in range(i * side, (i + 1) * side):
+                for x in range(j * side, (j + 1) * side):
+                    all_good &= good[y, x]
+                    wanted[i, j] |= asked[y, x]
+                    first += u[y, x]
+                    second += amplitude[y, x]
+                    third += variance[y, x]
+            whole[i, j] = all_good
+            u_mean[i, j], amplitude_mean[i, j], variance_mean[i, j] = first * share, second * share, third * share
+            for t in range(z.shape[0]):
+                total = np.complex64(0)
+                if all_good:
+                    for y in range(i * side, (i + 1) * side):
+                        for x in range(j * side, (j + 1) * side):
+                            total += z[t, y, x]
+                z_mean[t, i, j] = total * share
 
 
 def _found(
