@@ -23,18 +23,18 @@ FIELDS = 17
 ROWS = 2 * FIELDS + 1
 """Of a pixel's result: the best hypothesis, its rival, and half the difference of their scores."""
 
-_FIRST_STEPS = 2
-"""Levenberg-Marquardt steps after which hopeless hypotheses are given up."""
 _HOPELESS_CHI2 = 25.0
 """Excess over the best hypothesis from which one is hopeless."""
-_STEPS = 12
-"""Further steps at most; two or three are usual."""
+_STEPS = 14
+"""Levenberg-Marquardt steps at most; two or three are usual."""
 _CONVERGED_CHI2 = 1e-2
 """A step that lowers χ² by less ends a refinement: it moves no coordinate by more than 1/10 of its σ."""
 _VISIBLE_SIGMAS = 5.0
 """A direct path that is weaker than this is none."""
 _SAME_PX = 0.5
 """Direct places nearer than this are one place, whatever the bounce is."""
+_SAME_FIT_PX = 0.25
+"""A hypothesis whose first step leads this near to a fit that is known, in all places, leads to that fit."""
 _TINY = 1e-300
 
 
@@ -153,18 +153,46 @@ def _factorise(normal: Reals, damping: float, known: Reals, factor: Reals) -> bo
 
 
 @compiled  # pragma: no cover
-def _solve(factor: Reals, right: Reals, out: Reals) -> None:
-    for a in range(8):
+def _forward(factor: Reals, right: Reals, first: int, out: Reals) -> None:
+    """Solve with the lower triangle for a right side that is zero before ``first``."""
+    for a in range(first, 8):
         s = right[a]
-        for b in range(a):
+        for b in range(first, a):
             s -= factor[a, b] * out[b]
         out[a] = s * factor[a, a]
+
+
+@compiled  # pragma: no cover
+def _backward(factor: Reals, right: Reals, out: Reals) -> None:
+    """Solve with the upper triangle, the transpose of the lower."""
     for k in range(8):
         a = 7 - k
-        s = out[a]
+        s = right[a]
         for b in range(a + 1, 8):
             s -= factor[b, a] * out[b]
         out[a] = s * factor[a, a]
+
+
+@compiled  # pragma: no cover
+def _variance(factor: Reals, of: Reals, first: int, work: Reals) -> float:
+    """Variance of a linear combination ``of`` (8,) of the parameters that is zero before ``first``."""
+    _forward(factor, of, first, work)
+    total = 0.0
+    for k in range(first, 8):
+        total += work[k] * work[k]
+    return total
+
+
+@compiled  # pragma: no cover
+def _leads_to_known(thetas: Reals, step: Reals, scores: Reals, h: int, count: int) -> bool:
+    """Whether the first step of the hypothesis ``h`` ends at one of those that have a score already."""
+    for other in range(count):
+        away = 0.0 if scores[other] < math.inf else math.inf
+        for k in (0, 1, 4, 5):
+            away = max(away, abs(thetas[other, k] - thetas[h, k] - step[k]))
+        if away < _SAME_FIT_PX:
+            return True
+    return False
 
 
 @compiled  # pragma: no cover
@@ -182,7 +210,8 @@ def _improve(
         if not _factorise(normal, damping, nothing, factor):
             damping = max(10 * damping, 1e-3)
             continue
-        _solve(factor, slope, step)
+        _forward(factor, slope, 0, trial)
+        _backward(factor, trial, step)
         shorten = 1.0
         for k in (0, 1, 4, 5):
             # A radian at most, so that no fringe order is left.
@@ -232,7 +261,7 @@ def joint_block(
     ya, yb = np.empty(count_a, np.complex128), np.empty(count_b, np.complex128)
     wa, wb = np.empty((4, count_a)), np.empty((4, count_b))
     thetas, priors, gradients = np.empty((most, 8)), np.empty((most, 7)), np.empty((most, 8))
-    chi2s, scores, done = np.empty(most), np.empty(most), np.zeros(most, np.bool_)
+    chi2s, scores, promised, steps = np.empty(most), np.empty(most), np.empty(most), np.empty((most, 8))
     normals, factor, normal2 = np.zeros((most, 8, 8)), np.zeros((8, 8)), np.zeros((8, 8))
     step, trial, slope2, unit = np.empty(8), np.empty(8), np.empty(8), np.empty(8)
     nothing, anywhere = np.zeros(8), np.zeros(8)
@@ -250,43 +279,56 @@ def joint_block(
                 break
             if bounds[n, h] > least + _HOPELESS_CHI2:
                 continue
-            theta, normal, gradient = thetas[tried], normals[tried], gradients[tried]
+            theta = thetas[tried]
             for k in range(8):
                 theta[k] = seeds[n, h, k]
             _set_line(priors[tried], prior, lines[n, h, 0], lines[n, h, 1], lines[n, h, 2])
-            chi2 = _normal_equations(ya, wa, yb, wb, comb, priors[tried], theta, normal, gradient)
-            chi2s[tried], done[tried] = _improve(
-                ya, wa, yb, wb, comb, priors[tried], theta, chi2, _FIRST_STEPS, normal, gradient, work
+            chi2s[tried] = _normal_equations(
+                ya, wa, yb, wb, comb, priors[tried], theta, normals[tried], gradients[tried]
             )  # fmt: skip
-            if chi2s[tried] < math.inf:
-                least = min(least, chi2s[tried])
-                tried += 1
-        best = -1
-        for h in range(tried):
-            scores[h] = math.inf
-            if not chi2s[h] <= least + _HOPELESS_CHI2:
+            if not _factorise(normals[tried], 1e-9, nothing, factor):
                 continue
+            _forward(factor, gradients[tried], 0, step)
+            promised[tried] = chi2s[tried]
+            for k in range(8):
+                promised[tried] -= step[k] * step[k]
+            if not promised[tried] < least + _HOPELESS_CHI2:
+                continue
+            _backward(factor, step, steps[tried])
+            least = min(least, promised[tried])
+            scores[tried] = math.inf
+            tried += 1
+        # The most promising first: what it reaches shows which of the others are hopeless, and which lead to it.
+        best, least = -1, math.inf
+        for _ in range(tried):
+            h = promised[:tried].argmin()
+            if not promised[h] < least + _HOPELESS_CHI2:
+                break
+            promised[h] = math.inf
             theta = thetas[h]
-            if not done[h]:
-                chi2s[h], _ = _improve(
-                    ya, wa, yb, wb, comb, priors[h], theta, chi2s[h], _STEPS, normals[h], gradients[h], work
-                )  # fmt: skip
-                least = min(least, chi2s[h])
+            if _leads_to_known(thetas, steps[h], scores, h, tried):
+                continue
+            chi2s[h], _ = _improve(
+                ya, wa, yb, wb, comb, priors[h], theta, chi2s[h], _STEPS, normals[h], gradients[h], work
+            )  # fmt: skip
+            least = min(least, chi2s[h])
+            if not chi2s[h] < least + _HOPELESS_CHI2:
+                continue
             if not (low_a <= theta[0] < high_a and low_b <= theta[4] < high_b):
                 continue
             if not _factorise(normals[h], 0.0, anywhere, factor):
                 continue
             # Evidence by Laplace's method, with a scale-free prior on the amplitudes.
             score = chi2s[h] + 2 * math.log(theta[2] + theta[3])
+            reciprocal = 1.0
             for k in range(8):
-                score -= 2 * math.log(factor[k, k])
+                reciprocal *= factor[k, k]
                 unit[k] = 1.0 if k == 2 else 0.0
-            _solve(factor, unit, step)
-            if not theta[2] > _VISIBLE_SIGMAS * math.sqrt(step[2]):
+            score -= 2 * math.log(reciprocal)
+            if not theta[2] > _VISIBLE_SIGMAS * math.sqrt(_variance(factor, unit, 2, step)):
                 continue
             unit[3] = -1.0
-            _solve(factor, unit, step)
-            lead = (theta[2] - theta[3]) / math.sqrt(max(step[2] - step[3], _TINY))
+            lead = (theta[2] - theta[3]) / math.sqrt(max(_variance(factor, unit, 2, step), _TINY))
             sure = 0.5 * math.erfc(-lead / math.sqrt(2.0))
             scores[h] = score - 2 * math.log(larger_is_direct * sure + (1 - larger_is_direct) * (1 - sure))
             if best < 0 or scores[h] < scores[best]:
@@ -307,6 +349,5 @@ def joint_block(
                 out[row + k, p] = thetas[h, k]
                 for j in range(8):
                     unit[j] = 1.0 if j == k else 0.0
-                _solve(factor, unit, step)
-                out[row + 8 + k, p] = math.sqrt(max(step[k], 0.0))
+                out[row + 8 + k, p] = math.sqrt(_variance(factor, unit, k, step))
             out[row + 16, p] = chi2s[h]
