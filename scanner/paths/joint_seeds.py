@@ -28,7 +28,7 @@ _NEAR_LINE_PX, _NEAR_LINE_SIGMAS = 3.0, 6.0
 """How far from the line a fit of the axis across may lie and still be tried."""
 _APART_PX = 80.0
 """Distances of the paths along the line up to which they are sought with amplitudes from across it, px."""
-_HOPELESS_CHI2 = 60.0
+_HOPELESS_CHI2 = 35.0
 """χ² above the best from which a distance or a fit across is hopeless."""
 _DISTANCE_STEPS = 2
 """Gauss-Newton steps of a distance: it is refined again."""
@@ -38,7 +38,7 @@ _SAME_PX = 2.0
 
 @compiled  # pragma: no cover
 def order_turns(count: int, omega0: float, step: float) -> Phasors:
-    """(_ORDERS, T) by what a path one, two, … fringes of the middle frequency further on is turned at each frequency."""
+    """(_ORDERS, T) turn, at each frequency, of a path that lies one, two, … fringes of the middle one further on."""
     turns = np.empty((_ORDERS, count), np.complex128)
     centre = omega0 + 0.5 * (count - 1) * step
     for k in range(_ORDERS):
@@ -177,8 +177,8 @@ def _distance(power: Reals, weight: Reals, comb: Reals, a1: float, a2: float, si
 
 @compiled  # pragma: no cover
 def _pairs(
-    ya: Phasors, ga: Reals, comb: Reals, turns: Phasors, a1: float, bounce: float, sigma_bounce: float, low: float, high: float,
-    left: Phasors, moduli: Reals, distances: Reals, found: Reals,
+    ya: Phasors, ga: Reals, comb: Reals, turns: Phasors, a1: float, bounce: float, sigma_bounce: float, low: float,
+    high: float, left: Phasors, moduli: Reals, distances: Reals, found: Reals,
 ) -> None:  # fmt: skip
     """Places u₁, u₂ along the line for two paths of amplitudes a₁ and about ``bounce``.
 
@@ -298,7 +298,8 @@ def seed_block(
                 if not off < allowed:
                     continue
                 _pairs(
-                    ya, ga, comb, turns_a, b1 / kappa, b2 / kappa, prior[6], low_a, high_a, left, moduli, distances, pairs
+                    ya, ga, comb, turns_a, b1 / kappa, b2 / kappa, prior[6], low_a, high_a, left, moduli, distances,
+                    pairs,
                 )  # fmt: skip
                 for j in range(PAIRS):
                     # The line through the place nearest to where it is known.
