@@ -20,6 +20,7 @@ from scanner.paths import (
     Coupling,
     ask_neighbours,
     choose_direct,
+    corroborated,
     measure_coupling,
     separate_jointly,
     separate_two_paths,
@@ -59,7 +60,8 @@ class Separated:
     plausible
         Whether the separation fits: good enough to say where to light, where many pixels vote.
     trusted
-        Whether the fringe orders and the choice of the direct path are clear as well: good enough to be a coordinate.
+        Whether the fringe orders and the choice of the direct path are clear as well, and with a rig that there are two
+        paths is corroborated: good enough to be a coordinate.
     third
         Whether neither one nor two paths fit.
     off_line
@@ -138,6 +140,9 @@ def _together(
     found = ask_neighbours(found, pixels, known, planes[0], planes[1], _CLEAR_PLACE)
     best = found.best
     plausible = best.chi2 < limit
+    clear = plausible & (found.confidence > _CLEAR_PLACE)
+    fringe_px = 1 / float(np.mean(said["y" if found.along == 0 else "x"].frequency))
+    trusted = clear & corroborated(found, pixels, detection.region.shape, clear, fringe_px)
     blur = [
         best.sigma[k] / _alone(said[a], best.amplitude[0, k])  # type: ignore[index]
         for k, a in enumerate(("x", "y"))
@@ -149,10 +154,10 @@ def _together(
         {"x": best.sigma[0], "y": best.sigma[1]},
         {"x": best.bounce[0], "y": best.bounce[1]},
         plausible,
-        plausible & (found.confidence > _CLEAR_PLACE),
+        trusted,
         found.third,
         ~plausible & ~found.third,
-        plausible & (found.confidence > _CLEAR_PLACE) & (best.sigma_bounce < _LOCATED_PX).all(axis=0),
+        trusted & (best.sigma_bounce < _LOCATED_PX).all(axis=0),
         np.asarray(blur[found.along], np.float32),
     )
 

@@ -2,6 +2,7 @@
 
 from scanner.paths.choice import DirectPath, choose_direct
 from scanner.paths.comb import SeparationPlanError
+from scanner.paths.corroboration import corroborated
 from scanner.paths.joint import (
     AxisPhasorsOf,
     Coupling,
@@ -26,6 +27,7 @@ __all__ = [
     "ask_neighbours",
     "choose_direct",
     "compile_all",
+    "corroborated",
     "measure_coupling",
     "separate_candidates",
     "separate_jointly",

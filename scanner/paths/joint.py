@@ -27,6 +27,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from scanner.paths.comb import prepare
 from scanner.paths.joint_kernels import FIELDS, ROWS, joint_block
+from scanner.paths.joint_nearby import Profiles, workspace
 from scanner.paths.joint_seeds import PAIRS, seed_block
 from scanner.paths.kernels import Floats
 from scanner.paths.separation import CORES, separate_candidates
@@ -234,6 +235,7 @@ def separate_jointly(
     za, sigma_a, comb_a = prepare(a.z, a.frequency, a.sigma_z, a.extent, a.gain)
     zb, sigma_b, comb_b = prepare(b.z, b.frequency, b.sigma_z, b.extent, b.gain)
     comb = np.array([*comb_a.start_and_step, *comb_b.start_and_step])
+    profiles_a, profiles_b = Profiles.of(comb_a), Profiles.of(comb_b)
     dof = 2 * (len(a.frequency) + len(b.frequency)) - 8 + PRIORS
 
     def decide(these: NDArray[np.intp], fits_across: Floats) -> None:
@@ -250,7 +252,10 @@ def separate_jointly(
             )  # fmt: skip
             seeds, lines, bounds = np.empty((count, most, 8)), np.empty((count, most, 3)), np.empty((count, most))
             seed_block(*data, first, place, rise, fits_across, prior, start, seeds, lines, bounds)
-            joint_block(*data, seeds, lines, bounds, prior, LARGER_IS_DIRECT, found, start)
+            joint_block(
+                *data, seeds, lines, bounds, prior, LARGER_IS_DIRECT, *profiles_a.arrays, *profiles_b.arrays,
+                *workspace(profiles_a, profiles_b), found, start,
+            )  # fmt: skip
 
         with ThreadPoolExecutor(CORES) as pool:
             list(pool.map(joint, range(0, these.size, _BLOCK)))

@@ -1,312 +1,174 @@
-"""Refinement of the hypotheses of both axes together, and the choice between them; see `scanner.paths.joint`.
+"""The choice between the hypotheses of both axes together; see `scanner.paths.joint`.
 
-One axis, *along*, is that which the epipolar line runs along; the other is *across*. All kernels of a compiled function
-live in one file because Numba's cache looks at that file only.
+One axis, *along*, is that which the epipolar line runs along; the other is *across*.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.paths.rotation import compiled, rotation
+from scanner.paths.joint_fit import Reals, factorise, load, set_line, variance
+from scanner.paths.joint_hypotheses import HOPELESS_CHI2, apart, leads_to_known, propose, refine, rival
+from scanner.paths.joint_nearby import NEARBY, nearby
+from scanner.paths.joint_spread import OUTSIDE, by_bounce, widened
+from scanner.paths.rotation import compiled
 
 Floats = NDArray[np.float32]
-Reals = NDArray[np.float64]
-Phasors = NDArray[np.complex128]
 
 FIELDS = 17
 """Of a hypothesis: u₁, u₂, a₁, a₂ along the line and across it, the σ of all eight, χ²."""
 ROWS = 2 * FIELDS + 1
 """Of a pixel's result: the best hypothesis, its rival, and half the difference of their scores."""
-
-_FIRST_STEPS = 2
-"""Levenberg-Marquardt steps after which hopeless hypotheses are given up."""
-_HOPELESS_CHI2 = 25.0
-"""Excess over the best hypothesis from which one is hopeless."""
-_STEPS = 12
-"""Further steps at most; two or three are usual."""
-_CONVERGED_CHI2 = 1e-2
-"""A step that lowers χ² by less ends a refinement: it moves no coordinate by more than 1/10 of its σ."""
-_VISIBLE_SIGMAS = 5.0
-"""A direct path that is weaker than this is none."""
-_SAME_PX = 0.5
-"""Direct places nearer than this are one place, whatever the bounce is."""
-_TINY = 1e-300
-
-
-@compiled  # pragma: no cover
-def _load(
-    z: NDArray[np.complex64], gain: Reals, sigma: float, p: int, omega0: float, step: float, y: Phasors, w: Reals
-) -> None:  # fmt: skip
-    """Phasors of a pixel over the trend, and the sums' weights: ``w[k]`` are g ωᵏ, and ``w[3]`` starts with Σ g|y|²."""
-    power = 0.0
-    for t in range(z.shape[0]):
-        omega = omega0 + t * step
-        y[t] = (1 / gain[t]) * z[t, p]
-        w[0, t] = (gain[t] / sigma) ** 2
-        w[1, t] = w[0, t] * omega
-        w[2, t] = w[1, t] * omega
-        power += w[0, t] * (y[t].real * y[t].real + y[t].imag * y[t].imag)
-    w[3, 0] = power
-
-
-@compiled  # pragma: no cover
-def _axis_normal(
-    y: Phasors, w: Reals, omega0: float, step: float, theta: Reals, first: int, normal: Reals, slope: Reals
-) -> float:
-    """Write the data of one axis into the normal equations; returns its χ².
-
-    ``theta[first:first + 4]`` are u₁, u₂, a₁, a₂; ``y`` (T,) and ``w`` (4, T) as `_load` leaves them.
-    """
-    u1, u2, a1, a2 = theta[first], theta[first + 1], theta[first + 2], theta[first + 3]
-    e1, turn1 = rotation(-omega0 * u1), rotation(-step * u1)
-    e2, turn2 = rotation(-omega0 * u2), rotation(-step * u2)
-    c1 = c2 = f1 = f2 = m0 = m1 = m2 = s0 = s2 = 0.0
-    for t in range(y.size):
-        # In turned coordinates: what is along a path changes its amplitude, what is across its place.
-        q1, q2, p = e1 * y[t], e2 * y[t], e1 * e2.conjugate()
-        w0, w1, w2 = w[0, t], w[1, t], w[2, t]
-        c1 += w0 * q1.real
-        c2 += w0 * q2.real
-        f1 += w1 * q1.imag
-        f2 += w1 * q2.imag
-        m0 += w0 * p.real
-        m1 += w1 * p.imag
-        m2 += w2 * p.real
-        s0 += w0
-        s2 += w2
-        e1 *= turn1
-        e2 *= turn2
-    i, j, k, m = first, first + 1, first + 2, first + 3
-    normal[i, i] = a1 * a1 * s2
-    normal[j, i] = a1 * a2 * m2
-    normal[j, j] = a2 * a2 * s2
-    # Re(conj(i ω a₁ e₁) e₂) = ω a₁ Im(conj(e₁) e₂), and the other way round; a path's own is zero.
-    normal[k, i], normal[m, i] = 0.0, a1 * m1
-    normal[k, j], normal[m, j] = -a2 * m1, 0.0
-    normal[k, k], normal[m, k], normal[m, m] = s0, m0, s0
-    slope[i] = a1 * (f1 - a2 * m1)
-    slope[j] = a2 * (f2 + a1 * m1)
-    slope[k] = c1 - a1 * s0 - a2 * m0
-    slope[m] = c2 - a2 * s0 - a1 * m0
-    return float(w[3, 0] - a1 * (c1 + slope[k]) - a2 * (c2 + slope[m]))
-
-
-@compiled  # pragma: no cover
-def _normal_equations(
-    ya: Phasors, wa: Reals, yb: Phasors, wb: Reals, comb: Reals, prior: Reals, theta: Reals, normal: Reals, slope: Reals
-) -> float:  # fmt: skip
-    """χ² of both axes and the priors, its Gauss-Newton matrix (lower half) and the negative half gradient.
-
-    ``comb`` holds 2πf₀ and 2πΔf of the axis along and of the axis across. ``prior`` holds where the epipolar line is
-    left, the place across there, the line's slope, its σ; ln κ; σ of the two log ratios of amplitudes.
-    """
-    for a in range(4, 8):
-        for b in range(4):
-            normal[a, b] = 0.0
-    chi2 = _axis_normal(ya, wa, comb[0], comb[1], theta, 0, normal, slope)
-    chi2 += _axis_normal(yb, wb, comb[2], comb[3], theta, 4, normal, slope)
-    weight = 1 / (prior[3] * prior[3])
-    off = theta[4] - prior[1] - prior[2] * (theta[0] - prior[0])
-    chi2 += weight * off * off
-    normal[0, 0] += weight * prior[2] * prior[2]
-    normal[4, 0] -= weight * prior[2]
-    normal[4, 4] += weight
-    slope[0] += weight * prior[2] * off
-    slope[4] -= weight * off
-    for k in range(2):
-        a, b = theta[2 + k], theta[6 + k]
-        weight = 1 / (prior[5 + k] * prior[5 + k])
-        off = math.log(b / a) - prior[4]
-        chi2 += weight * off * off
-        normal[2 + k, 2 + k] += weight / (a * a)
-        normal[6 + k, 2 + k] -= weight / (a * b)
-        normal[6 + k, 6 + k] += weight / (b * b)
-        slope[2 + k] += weight * off / a
-        slope[6 + k] -= weight * off / b
-    return float(chi2)
-
-
-@compiled  # pragma: no cover
-def _factorise(normal: Reals, damping: float, known: Reals, factor: Reals) -> bool:
-    """Cholesky factor of the matrix with its diagonal raised; False where it is not positive.
-
-    ``known`` (8,) is added to the diagonal. The factor's diagonal holds its reciprocals.
-    """
-    for a in range(8):
-        for b in range(a):
-            s = normal[a, b]
-            for c in range(b):
-                s -= factor[a, c] * factor[b, c]
-            factor[a, b] = s * factor[b, b]
-        s = normal[a, a] * (1 + damping) + known[a]
-        for c in range(a):
-            s -= factor[a, c] * factor[a, c]
-        if not s > 1e-12 * normal[a, a]:
-            return False
-        factor[a, a] = 1 / math.sqrt(s)
-    return True
-
-
-@compiled  # pragma: no cover
-def _solve(factor: Reals, right: Reals, out: Reals) -> None:
-    for a in range(8):
-        s = right[a]
-        for b in range(a):
-            s -= factor[a, b] * out[b]
-        out[a] = s * factor[a, a]
-    for k in range(8):
-        a = 7 - k
-        s = out[a]
-        for b in range(a + 1, 8):
-            s -= factor[b, a] * out[b]
-        out[a] = s * factor[a, a]
-
-
-@compiled  # pragma: no cover
-def _improve(
-    ya: Phasors, wa: Reals, yb: Phasors, wb: Reals, comb: Reals, prior: Reals, theta: Reals, chi2: float, steps: int,
-    normal: Reals, slope: Reals, work: Any,
-) -> Any:  # fmt: skip
-    """Levenberg-Marquardt from ``theta``, whose χ² and normal equations are given; all are brought up to date.
-
-    Returns χ² and whether the last step gained next to nothing.
-    """
-    factor, step, trial, normal2, slope2, nothing = work
-    damping, converged = 0.0, False
-    for _ in range(steps):
-        if not _factorise(normal, damping, nothing, factor):
-            damping = max(10 * damping, 1e-3)
-            continue
-        _solve(factor, slope, step)
-        shorten = 1.0
-        for k in (0, 1, 4, 5):
-            # A radian at most, so that no fringe order is left.
-            shorten = min(shorten, 1 / max(1e-9, abs(step[k]) * comb[0 if k < 4 else 2]))
-        for k in (2, 3, 6, 7):
-            if step[k] < 0:
-                shorten = min(shorten, -0.7 * theta[k] / step[k])
-        for k in range(8):
-            trial[k] = theta[k] + shorten * step[k]
-        gained = _normal_equations(ya, wa, yb, wb, comb, prior, trial, normal2, slope2)
-        if gained <= chi2:
-            converged = chi2 - gained < _CONVERGED_CHI2
-            chi2 = gained
-            for a in range(8):
-                theta[a], slope[a] = trial[a], slope2[a]
-                for b in range(a + 1):
-                    normal[a, b] = normal2[a, b]
-            damping *= 0.1
-        else:
-            converged = gained - chi2 < _CONVERGED_CHI2
-            damping = max(10 * damping, 0.03)
-        if converged:
-            break
-    return chi2, converged
-
-
-@compiled  # pragma: no cover
-def _set_line(out: Reals, common: Reals, along: float, across: float, slope: float) -> None:
-    """Prior of a hypothesis: ``common`` with the epipolar line about (along, across)."""
-    for j in range(7):
-        out[j] = common[j]
-    out[0], out[1], out[2] = along, across, slope
-    out[3] = common[3] * math.sqrt(1 + slope * slope)
+_SAME_START_PX = 2.0
+"""A start this near to a known fit, in all places, leads to it."""
+_DOUBTFUL_SIGMAS = 1.3
+"""Excess of χ² in its standard deviations from which a fit is doubted: one good fit in ten."""
+_NEAR, _FARTHER = (1, 1), (4, 2)
+"""Steps of the direct place to either side of a fit, and how many are a fringe; the second where the fit is doubted."""
+_NEAR_RIVAL = 12.0
+"""Excess of a rival's score up to which it is looked at as closely as the best."""
+_NEGLIGIBLE = 1e-3
+"""Weight over that of the best from which a hypothesis says nothing about σ."""
 
 
 @compiled  # pragma: no cover
 def joint_block(
     za: NDArray[np.complex64], zb: NDArray[np.complex64], sigma_a: Reals, sigma_b: Reals, gain_a: Reals, gain_b: Reals,
     comb: Reals, low_a: float, high_a: float, low_b: float, high_b: float, seeds: Reals, lines: Reals, bounds: Reals,
-    prior: Reals, larger_is_direct: float, out: Floats, start: int,
+    prior: Reals, larger_is_direct: float, distance_a: Reals, table_a: Reals, length_a: Reals, taken_a: Reals,
+    distance_b: Reals, table_b: Reals, length_b: Reals, taken_b: Reals, near_a: Reals, near_b: Reals, near_x: Reals,
+    power_a: Reals, power_b: Reals, near_row: Reals, posterior_a: Reals, posterior_b: Reals, out: Floats, start: int,
 ) -> None:  # fmt: skip
     """The likeliest direct path of the pixels from ``start`` on, and its rival, as rows of ``out``.
 
-    ``seeds``, ``lines``, ``bounds`` as `scanner.paths.joint_seeds.seed_block` leaves them.
+    ``seeds``, ``lines``, ``bounds`` as `scanner.paths.joint_seeds.seed_block` leaves them; the arrays after
+    ``larger_is_direct`` are `Profiles.arrays` of both axes and `workspace` of `scanner.paths.joint_nearby`.
     """
     count_a, count_b, most = za.shape[0], zb.shape[0], bounds.shape[1]
+    room = most + 3 * NEARBY
+    dof = 2 * (count_a + count_b) - 5
+    doubtful = dof + _DOUBTFUL_SIGMAS * math.sqrt(2.0 * dof)
     ya, yb = np.empty(count_a, np.complex128), np.empty(count_b, np.complex128)
     wa, wb = np.empty((4, count_a)), np.empty((4, count_b))
-    thetas, priors, gradients = np.empty((most, 8)), np.empty((most, 7)), np.empty((most, 8))
-    chi2s, scores, done = np.empty(most), np.empty(most), np.zeros(most, np.bool_)
-    normals, factor, normal2 = np.zeros((most, 8, 8)), np.zeros((8, 8)), np.zeros((8, 8))
-    step, trial, slope2, unit = np.empty(8), np.empty(8), np.empty(8), np.empty(8)
-    nothing, anywhere = np.zeros(8), np.zeros(8)
+    thetas, steps = np.empty((room, 8)), np.empty((room, 8))
+    priors, gradients = np.empty((room, 7)), np.empty((room, 8))
+    chi2s, scores, promised, normals = np.empty(room), np.empty(room), np.empty(room), np.zeros((room, 8, 8))
+    weights, of_place, sigmas, found = np.empty(room), np.empty(room), np.zeros((room, 8)), np.empty((NEARBY, 9))
+    factor, step, nothing, anywhere, unit = np.zeros((8, 8)), np.empty(8), np.zeros(8), np.zeros(8), np.empty(8)
     for k in (0, 1, 4, 5):
         # No place is less known than anywhere in the picture.
         anywhere[k] = 12 / (high_a - low_a if k < 4 else high_b - low_b) ** 2
-    work = (factor, step, trial, normal2, slope2, nothing)
+    mixture = np.empty((max(room, len(posterior_a)), 3))
+    trial, normal2, slope2 = np.empty(8), np.zeros((8, 8)), np.empty(8)
     for n in range(bounds.shape[0]):
         p = start + n
-        _load(za, gain_a, sigma_a[p], p, comb[0], comb[1], ya, wa)
-        _load(zb, gain_b, sigma_b[p], p, comb[2], comb[3], yb, wb)
+        load(za, gain_a, sigma_a[p], p, comb[0], comb[1], ya, wa)
+        load(zb, gain_b, sigma_b[p], p, comb[2], comb[3], yb, wb)
         tried, least = 0, math.inf
         for h in range(most):
             if not bounds[n, h] < math.inf:
                 break
-            if bounds[n, h] > least + _HOPELESS_CHI2:
+            if bounds[n, h] > least + HOPELESS_CHI2:
                 continue
-            theta, normal, gradient = thetas[tried], normals[tried], gradients[tried]
             for k in range(8):
-                theta[k] = seeds[n, h, k]
-            _set_line(priors[tried], prior, lines[n, h, 0], lines[n, h, 1], lines[n, h, 2])
-            chi2 = _normal_equations(ya, wa, yb, wb, comb, priors[tried], theta, normal, gradient)
-            chi2s[tried], done[tried] = _improve(
-                ya, wa, yb, wb, comb, priors[tried], theta, chi2, _FIRST_STEPS, normal, gradient, work
-            )  # fmt: skip
-            if chi2s[tried] < math.inf:
-                least = min(least, chi2s[tried])
+                thetas[tried, k] = seeds[n, h, k]
+            set_line(priors[tried], prior, lines[n, h, 0], lines[n, h, 1], lines[n, h, 2])
+            if propose(
+                ya, wa, yb, wb, comb, thetas, priors, normals, gradients, chi2s, promised, steps, scores, factor, step,
+                nothing, tried, least,
+            ):  # fmt: skip
+                least = min(least, promised[tried])
                 tried += 1
-        best = -1
-        for h in range(tried):
-            scores[h] = math.inf
-            if not chi2s[h] <= least + _HOPELESS_CHI2:
-                continue
-            theta = thetas[h]
-            if not done[h]:
-                chi2s[h], _ = _improve(
-                    ya, wa, yb, wb, comb, priors[h], theta, chi2s[h], _STEPS, normals[h], gradients[h], work
-                )  # fmt: skip
-                least = min(least, chi2s[h])
-            if not (low_a <= theta[0] < high_a and low_b <= theta[4] < high_b):
-                continue
-            if not _factorise(normals[h], 0.0, anywhere, factor):
-                continue
-            # Evidence by Laplace's method, with a scale-free prior on the amplitudes.
-            score = chi2s[h] + 2 * math.log(theta[2] + theta[3])
-            for k in range(8):
-                score -= 2 * math.log(factor[k, k])
-                unit[k] = 1.0 if k == 2 else 0.0
-            _solve(factor, unit, step)
-            if not theta[2] > _VISIBLE_SIGMAS * math.sqrt(step[2]):
-                continue
-            unit[3] = -1.0
-            _solve(factor, unit, step)
-            lead = (theta[2] - theta[3]) / math.sqrt(max(step[2] - step[3], _TINY))
-            sure = 0.5 * math.erfc(-lead / math.sqrt(2.0))
-            scores[h] = score - 2 * math.log(larger_is_direct * sure + (1 - larger_is_direct) * (1 - sure))
-            if best < 0 or scores[h] < scores[best]:
-                best = h
-        if best < 0:
+        least = refine(
+            ya, wa, yb, wb, comb, thetas, priors, normals, gradients, chi2s, promised, steps, scores, factor, step,
+            trial, normal2, slope2, nothing, unit, anywhere, low_a, high_a, low_b, high_b, larger_is_direct, 0, tried,
+            math.inf,
+        )  # fmt: skip
+        if tried == 0:
             continue
-        rival = -1
+        best = int(scores[:tried].argmin())
+        if not scores[best] < math.inf:
+            continue
+        # Whether there is another bounce that fits about as well, or another fringe order.
+        other, known_a, known_b = -1, 0, 0
+        for turn in range(3):
+            about = other if turn == 1 else best
+            if turn == 1 and (other < 0 or scores[other] > scores[best] + _NEAR_RIVAL):
+                continue
+            # Where even the best fits badly, what fits better may lie farther off.
+            if turn == 2 and not chi2s[best] > doubtful:
+                break
+            reach, per_fringe = _FARTHER if turn == 2 else _NEAR
+            starts, known_a, known_b = nearby(
+                ya, yb, gain_a, gain_b, sigma_a[p], sigma_b[p], comb, thetas[about], chi2s[about], prior, distance_a,
+                table_a, length_a, taken_a, distance_b, table_b, length_b, taken_b, near_a, near_b, near_x, power_a,
+                power_b, near_row, posterior_a, posterior_b, known_a, known_b, found, reach, per_fringe,
+            )  # fmt: skip
+            first = tried
+            for j in range(starts):
+                for k in range(8):
+                    thetas[tried, k] = found[j, k]
+                for k in range(7):
+                    priors[tried, k] = priors[about, k]
+                for k in range(8):
+                    steps[tried, k] = 0.0
+                if leads_to_known(thetas, steps[tried], scores, tried, first, _SAME_START_PX):
+                    continue
+                if propose(
+                ya, wa, yb, wb, comb, thetas, priors, normals, gradients, chi2s, promised, steps, scores, factor, step,
+                nothing, tried, least,
+            ):  # fmt: skip
+                    tried += 1
+            least = refine(
+                ya, wa, yb, wb, comb, thetas, priors, normals, gradients, chi2s, promised, steps, scores, factor, step,
+                trial, normal2, slope2, nothing, unit, anywhere, low_a, high_a, low_b, high_b, larger_is_direct, first,
+                tried, least,
+            )  # fmt: skip
+            best = int(scores[:tried].argmin())
+            other = rival(thetas, scores, best, tried)
         for h in range(tried):
-            away = max(abs(thetas[h, 0] - thetas[best, 0]), abs(thetas[h, 4] - thetas[best, 4]))
-            if scores[h] < math.inf and away > _SAME_PX and (rival < 0 or scores[h] < scores[rival]):
-                rival = h
-        out[2 * FIELDS, p] = 0.5 * (scores[rival] - scores[best]) if rival >= 0 else math.inf
-        for h, row in ((best, 0), (rival, FIELDS)):
+            weights[h] = math.exp(0.5 * (scores[best] - scores[h]))
+        here = elsewhere = 0.0
+        for h in range(tried):
+            if apart(thetas, h, best):
+                elsewhere += weights[h]
+            else:
+                here += weights[h]
+        out[2 * FIELDS, p] = math.log(here / elsewhere) if elsewhere > 0 else math.inf
+        for h, row in ((best, 0), (other, FIELDS)):
             if h < 0:
                 continue
-            _factorise(normals[h], 1e-9, nothing, factor)
+            others = 0.0
+            for i in range(tried):
+                of_place[i] = 0.0
+                if weights[i] > _NEGLIGIBLE * weights[h] and not apart(thetas, i, h):
+                    of_place[i] = weights[i]
+                    others += weights[i] if i != h else 0.0
+            alone = others < 0.5 * OUTSIDE * weights[h]
+            for i in range(tried):
+                if i == h or (of_place[i] > 0 and not alone):
+                    factorise(normals[i], 1e-9, nothing, factor)
+                    for k in range(8):
+                        for j in range(8):
+                            unit[j] = 1.0 if j == k else 0.0
+                        sigmas[i, k] = math.sqrt(variance(factor, unit, k, step))
             for k in range(8):
                 out[row + k, p] = thetas[h, k]
-                for j in range(8):
-                    unit[j] = 1.0 if j == k else 0.0
-                _solve(factor, unit, step)
-                out[row + 8 + k, p] = math.sqrt(max(step[k], 0.0))
+                sigma = sigmas[h, k]
+                if not alone:
+                    parts = 0
+                    for i in range(tried):
+                        if of_place[i] > 0:
+                            mixture[parts, 0] = of_place[i]
+                            mixture[parts, 1], mixture[parts, 2] = thetas[i, k], sigmas[i, k]
+                            parts += 1
+                    sigma = widened(mixture, parts, thetas[h, k], sigma)
+                if k == 0:
+                    sigma = max(sigma, by_bounce(posterior_a, known_a, thetas[h, 0], sigmas[h, 0], mixture))
+                elif k == 4:
+                    sigma = max(sigma, by_bounce(posterior_b, known_b, thetas[h, 4], sigmas[h, 4], mixture))
+                out[row + 8 + k, p] = sigma
             out[row + 16, p] = chi2s[h]

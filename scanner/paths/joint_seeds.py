@@ -28,16 +28,66 @@ _NEAR_LINE_PX, _NEAR_LINE_SIGMAS = 3.0, 6.0
 """How far from the line a fit of the axis across may lie and still be tried."""
 _APART_PX = 80.0
 """Distances of the paths along the line up to which they are sought with amplitudes from across it, px."""
-_HOPELESS_CHI2 = 60.0
+_HOPELESS_CHI2 = 35.0
 """χ² above the best from which a distance or a fit across is hopeless."""
-_DISTANCE_STEPS, _PAIR_STEPS = 3, 1
-"""Gauss-Newton steps of a distance, and of a pair of places: all are refined again."""
+_DISTANCE_STEPS = 2
+"""Gauss-Newton steps of a distance: it is refined again."""
 _SAME_PX = 2.0
 """Starts this near to each other in all places lead to one and the same fit."""
 
 
 @compiled  # pragma: no cover
-def _rest(zb: Phasors, gb: Reals, comb: Reals, u1: float, a1: float, low: float, high: float, left: Phasors) -> Any:
+def order_turns(count: int, omega0: float, step: float) -> Phasors:
+    """(_ORDERS, T) turn, at each frequency, of a path that lies one, two, … fringes of the middle one further on."""
+    turns = np.empty((_ORDERS, count), np.complex128)
+    centre = omega0 + 0.5 * (count - 1) * step
+    for k in range(_ORDERS):
+        for t in range(count):
+            turns[k, t] = rotation(2 * math.pi * (k + 1) * (omega0 + t * step - centre) / centre)
+    return turns
+
+
+@compiled  # pragma: no cover
+def _place(
+    left: Phasors, g: Reals, lag: complex, omega0: float, step: float, turns: Phasors, orders: int, low: float,
+    high: float,
+) -> Any:  # fmt: skip
+    """Place of the one path in ``left``, whose pole has the angle of ``lag``, and Σ g times its amplitude there.
+
+    Of the place that the phase at the middle frequency gives and of ``orders`` fringes to either side that where there
+    is most light; -inf where none of them lies within the picture.
+    """
+    centre, period = omega0 + 0.5 * (left.size - 1) * step, 2 * math.pi / step
+    coarse = math.atan2(lag.imag, lag.real) / step
+    coarse -= period * math.floor((coarse - 0.5 * (low + high)) / period + 0.5)
+    e, turn, c = rotation(-omega0 * coarse), rotation(-step * coarse), 0j
+    for t in range(left.size):
+        c += g[t] * (e * left[t])
+        e *= turn
+    fine = coarse + math.atan2(c.imag, c.real) / centre
+    e, turn = rotation(-omega0 * fine), rotation(-step * fine)
+    here = up1 = up2 = down1 = down2 = 0.0
+    for t in range(left.size):
+        r = g[t] * (e * left[t])
+        here += r.real
+        # A path k fringes on is turned by as much one way as one k fringes back is the other.
+        even, odd = r.real * turns[0, t].real, r.imag * turns[0, t].imag
+        up1, down1 = up1 + (even + odd), down1 + (even - odd)
+        even, odd = r.real * turns[1, t].real, r.imag * turns[1, t].imag
+        up2, down2 = up2 + (even + odd), down2 + (even - odd)
+        e *= turn
+    place, most = fine, -math.inf
+    for k, s in ((-2, down2), (-1, down1), (0, here), (1, up1), (2, up2)):
+        u = fine + k * 2 * math.pi / centre
+        if s > most and abs(k) <= orders and low <= u < high:
+            place, most = u, s
+    return place, most
+
+
+@compiled  # pragma: no cover
+def _rest(
+    zb: Phasors, gb: Reals, comb: Reals, turns: Phasors, u1: float, a1: float, low: float, high: float, left: Phasors
+) -> Any:  # fmt: skip
     """Place and amplitude of the one path in what the path (u₁, a₁) leaves of an axis; amplitude 0 where none is."""
     omega0, step = comb[2], comb[3]
     e, turn = rotation(omega0 * u1), rotation(step * u1)
@@ -48,82 +98,45 @@ def _rest(zb: Phasors, gb: Reals, comb: Reals, u1: float, a1: float, low: float,
         if t > 0:
             lag += gb[t] * (left[t] * left[t - 1].conjugate())
         e *= turn
-    period = 2 * math.pi / step
-    coarse = math.atan2(lag.imag, lag.real) / step
-    coarse -= period * math.floor((coarse - 0.5 * (low + high)) / period + 0.5)
-    centre = omega0 + 0.5 * (zb.size - 1) * step
-    e, turn, c = rotation(-omega0 * coarse), rotation(-step * coarse), 0j
-    for t in range(zb.size):
-        c += gb[t] * (e * left[t])
-        e *= turn
-    fine = coarse + math.atan2(c.imag, c.real) / centre
-    place, most = fine, 0.0
-    for k in range(-_ORDERS, _ORDERS + 1):
-        u = fine + k * 2 * math.pi / centre
-        if not (low <= u < high):
-            continue
-        e, turn, s = rotation(-omega0 * u), rotation(-step * u), 0.0
-        for t in range(zb.size):
-            s += gb[t] * (e * left[t]).real
-            e *= turn
-        if s > most:
-            place, most = u, s
-    return place, most / total
+    place, most = _place(left[: zb.size], gb, lag, omega0, step, turns, _ORDERS, low, high)
+    return place, max(most, 0.0) / total
 
 
 @compiled  # pragma: no cover
 def _pair_at(
-    ya: Phasors, ga: Reals, comb: Reals, a1: float, a2: float, apart: float, low: float, high: float, left: Phasors
+    ya: Phasors, ga: Reals, comb: Reals, turns: Phasors, a1: float, a2: float, apart: float, low: float, high: float,
+    left: Phasors,
 ) -> Any:  # fmt: skip
     """Places of two paths of known amplitudes that are about ``apart`` from each other, and their χ²."""
     omega0, step = comb[0], comb[1]
-    centre, period = omega0 + 0.5 * (ya.size - 1) * step, 2 * math.pi / step
     e, turn, lag = rotation(omega0 * apart), rotation(step * apart), 0j
     for t in range(ya.size):
         left[t] = ya[t] * (a1 + a2 * e).conjugate()
         if t > 0:
             lag += ga[t] * (left[t] * left[t - 1].conjugate())
         e *= turn
-    coarse = math.atan2(lag.imag, lag.real) / step
-    coarse -= period * math.floor((coarse - 0.5 * (low + high)) / period + 0.5)
-    e, turn, c = rotation(-omega0 * coarse), rotation(-step * coarse), 0j
-    for t in range(ya.size):
-        c += ga[t] * (e * left[t])
-        e *= turn
-    fine = coarse + math.atan2(c.imag, c.real) / centre
-    u1, most = fine, -math.inf
-    for k in range(-1, 2):
-        u = fine + k * 2 * math.pi / centre
-        e, turn, s = rotation(-omega0 * u), rotation(-step * u), 0.0
-        for t in range(ya.size):
-            s += ga[t] * (e * left[t]).real
-            e *= turn
-        if s > most and low <= u < high:
-            u1, most = u, s
+    u1, _ = _place(left[: ya.size], ga, lag, omega0, step, turns, 1, low, high)
     u2 = u1 + apart
-    v1, v2, chi2 = u1, u2, math.inf
-    for _ in range(_PAIR_STEPS + 1):
-        # Gauss-Newton, half a radian at most; the last turn only takes χ².
-        u1, u2 = v1, v2
-        e1, turn1, e2, turn2 = rotation(omega0 * u1), rotation(step * u1), rotation(omega0 * u2), rotation(step * u2)
-        chi2 = n11 = n12 = n22 = s1 = s2 = 0.0
-        for t in range(ya.size):
-            off, w, omega = ya[t] - a1 * e1 - a2 * e2, ga[t], omega0 + t * step
-            chi2 += w * (off.real * off.real + off.imag * off.imag)
-            w *= omega
-            s1 += w * a1 * (e1.conjugate() * off).imag
-            s2 += w * a2 * (e2.conjugate() * off).imag
-            w *= omega
-            n11 += w * a1 * a1
-            n22 += w * a2 * a2
-            n12 += w * a1 * a2 * (e1.conjugate() * e2).real
-            e1 *= turn1
-            e2 *= turn2
-        inverse = 1 / (n11 * n22 * (1 + 1e-3) - n12 * n12)
-        d1, d2 = inverse * (n22 * s1 - n12 * s2), inverse * (n11 * s2 - n12 * s1)
-        shorten = 1 / max(1.0, 2 * omega0 * max(abs(d1), abs(d2)))
-        v1, v2 = u1 + shorten * d1, u2 + shorten * d2
-    return u1, u2, chi2
+    e1, turn1, e2, turn2 = rotation(omega0 * u1), rotation(step * u1), rotation(omega0 * u2), rotation(step * u2)
+    chi2 = n11 = n12 = n22 = s1 = s2 = 0.0
+    for t in range(ya.size):
+        off, w, omega = ya[t] - a1 * e1 - a2 * e2, ga[t], omega0 + t * step
+        chi2 += w * (off.real * off.real + off.imag * off.imag)
+        w *= omega
+        s1 += w * a1 * (e1.conjugate() * off).imag
+        s2 += w * a2 * (e2.conjugate() * off).imag
+        w *= omega
+        n11 += w * a1 * a1
+        n22 += w * a2 * a2
+        n12 += w * a1 * a2 * (e1.conjugate() * e2).real
+        e1 *= turn1
+        e2 *= turn2
+    # One Gauss-Newton step, half a radian at most, and what it promises.
+    inverse = 1 / (n11 * n22 * (1 + 1e-3) - n12 * n12)
+    d1, d2 = inverse * (n22 * s1 - n12 * s2), inverse * (n11 * s2 - n12 * s1)
+    shorten = 1 / max(1.0, 2 * omega0 * max(abs(d1), abs(d2)))
+    gain = shorten * (2 - shorten) * (s1 * d1 + s2 * d2)
+    return u1 + shorten * d1, u2 + shorten * d2, chi2 - gain
 
 
 @compiled  # pragma: no cover
@@ -136,7 +149,7 @@ def _distance(power: Reals, weight: Reals, comb: Reals, a1: float, a2: float, si
     omega0, step = comb[0], comb[1]
     chi2, prior = math.inf, 1 / (sigma_a2 * a2) ** 2
     d, b = apart, a2
-    for k in range(_DISTANCE_STEPS + 1):
+    for _ in range(_DISTANCE_STEPS):
         e, turn = rotation(omega0 * d), rotation(step * d)
         off, omega = a2 - b, omega0
         chi2, n11, n12, n22, s1, s2 = prior * off * off, 0.0, 0.0, prior, 0.0, prior * off
@@ -152,20 +165,20 @@ def _distance(power: Reals, weight: Reals, comb: Reals, a1: float, a2: float, si
             s2 += w * by_b * off
             e *= turn
             omega += step
-        if k == _DISTANCE_STEPS:
-            break
         # Where the moduli are extreme they say little of the distance: half a radian at most.
         n11 += 1e-3 * n22 * (a1 * omega0) ** 2
         inverse = 1 / (n11 * n22 - n12 * n12)
-        d += max(-0.5 / omega0, min(inverse * (n22 * s1 - n12 * s2), 0.5 / omega0))
-        b = max(0.5 * b, min(b + inverse * (n11 * s2 - n12 * s1), 2 * b))
+        step_d, step_b = inverse * (n22 * s1 - n12 * s2), inverse * (n11 * s2 - n12 * s1)
+        chi2 -= s1 * step_d + s2 * step_b
+        d += max(-0.5 / omega0, min(step_d, 0.5 / omega0))
+        b = max(0.5 * b, min(b + step_b, 2 * b))
     return d, b, chi2
 
 
 @compiled  # pragma: no cover
 def _pairs(
-    ya: Phasors, ga: Reals, comb: Reals, a1: float, bounce: float, sigma_bounce: float, low: float, high: float,
-    left: Phasors, moduli: Reals, distances: Reals, found: Reals,
+    ya: Phasors, ga: Reals, comb: Reals, turns: Phasors, a1: float, bounce: float, sigma_bounce: float, low: float,
+    high: float, left: Phasors, moduli: Reals, distances: Reals, found: Reals,
 ) -> None:  # fmt: skip
     """Places u₁, u₂ along the line for two paths of amplitudes a₁ and about ``bounce``.
 
@@ -199,7 +212,7 @@ def _pairs(
         if not least < min(distances[0, 0], found[0, 0]) + _HOPELESS_CHI2:
             break
         apart = -distances[number // 2, 1] if number % 2 else distances[number // 2, 1]
-        u1, u2, chi2 = _pair_at(ya, ga, comb, a1, a2, apart, low, high, left)
+        u1, u2, chi2 = _pair_at(ya, ga, comb, turns, a1, a2, apart, low, high, left)
         if not (low <= u1 < high and low <= u2 < high):
             continue
         place = PAIRS - 1
@@ -246,6 +259,7 @@ def seed_block(
     left, moduli = np.empty(max(count_a, count_b), np.complex128), np.empty((2, count_a))
     ga, gb = np.empty(count_a), np.empty(count_b)
     pairs, distances = np.empty((PAIRS, 4)), np.empty((PAIRS, 3))
+    turns_a, turns_b = order_turns(count_a, comb[0], comb[1]), order_turns(count_b, comb[2], comb[3])
     kappa = math.exp(prior[4])
     for n in range(bounds.shape[0]):
         p = start + n
@@ -265,7 +279,7 @@ def seed_block(
                 theta[0], theta[1] = fits[k, i, p], fits[k, 1 - i, p]
                 theta[2], theta[3] = fits[k, 2 + i, p], fits[k, 3 - i, p]
                 theta[4], theta[6] = place, kappa * theta[2]
-                theta[5], rest = _rest(yb, gb, comb, place, theta[6], low_b, high_b, left)
+                theta[5], rest = _rest(yb, gb, comb, turns_b, place, theta[6], low_b, high_b, left)
                 theta[7] = max(rest, 0.1 * kappa * theta[3])
                 lines[n, tried, 0], lines[n, tried, 1], lines[n, tried, 2] = theta[0], place, slopes[2 * k + i, p]
                 # Both axes together cannot fit better than this one alone.
@@ -284,7 +298,8 @@ def seed_block(
                 if not off < allowed:
                     continue
                 _pairs(
-                    ya, ga, comb, b1 / kappa, b2 / kappa, prior[6], low_a, high_a, left, moduli, distances, pairs
+                    ya, ga, comb, turns_a, b1 / kappa, b2 / kappa, prior[6], low_a, high_a, left, moduli, distances,
+                    pairs,
                 )  # fmt: skip
                 for j in range(PAIRS):
                     # The line through the place nearest to where it is known.

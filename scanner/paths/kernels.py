@@ -21,18 +21,18 @@ Floats = NDArray[np.float32]
 Reals = NDArray[np.float64]
 Phasors = NDArray[np.complex128]
 
-CANDIDATES = 4
+CANDIDATES = 3
 """Fits that are kept of a pixel, the best one first."""
 FIELDS = 7
 """Of a fit: score, v₁, v₂, a₁, a₂ and, per σ_z², the variances of a·v and of a."""
 
-_ORDER_CHI2 = 100.0
+_ORDER_CHI2 = 60.0
 """Fringe orders within this χ² of the float solution are tried."""
 _ORDER_REACH = 8.0
 """Fringes to either side of the float solution at most."""
 _ORDER_BEND = 0.2
 """Fringes by which the region widens per fringe from the float solution, because the valley of the likelihood bends."""
-_SLACK_CHI2 = 5.0
+_SLACK_CHI2 = 2.0
 """χ² by which a pair must promise to fit worse than those kept to be left out untried."""
 _ORDER_PAIRS = 100.0
 """Area of the region at most: one hopeless pixel must not cost the time of a hundred."""

@@ -1,0 +1,289 @@
+"""Other places of the bounce near a fit, all of them: what decides how well a direct place is known.
+
+About a direct place u₁ that is known to a fraction of a fringe the phasors of an axis are linear in all but the place
+of the bounce,
+
+    z_t e^{-iω_t u₁} = m_t (a₁ + a₁ δu iω_t + a₂ e^{iω_t d}) + noise,
+
+so that the power which a bounce at distance d explains beyond the direct path is one dot product with a profile that
+depends on the plan alone. All distances up to a period of the comb are looked at, and the direct place one fringe to
+either side as well: the minima of χ² that the fits of `scanner.paths.joint_seeds` do not lead to.
+
+Numba's cache of `joint_block` does not see this file: whoever changes it clears the cache.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanner.paths.comb import Comb
+from scanner.paths.rotation import compiled, rotation
+
+Reals = NDArray[np.float64]
+Phasors = NDArray[np.complex128]
+
+NEARBY = 8
+"""Pairs of places that are handed on, the likeliest."""
+_PLACES = 40
+"""Places of the bounce that are kept of one axis about one direct place: all that there can be."""
+_MOST_REACH = 4
+"""Steps that the direct place is moved at most."""
+_TRIED = 6
+"""Of these the ones, the likeliest first, that are tried with each of the other axis."""
+_HOPELESS_CHI2 = 14.0
+"""χ² above the best from which a place, or a pair, is hopeless."""
+_STEP_RAD = 0.8
+"""Step of the distances, as a phase: half of it costs 8 % of a path's power."""
+_CLOSEST_RAD = math.pi / 2
+"""Nearer than a quarter fringe, two paths are as good as one."""
+_CLEAR_SIGMAS = 5.0
+"""Amplitude over σ_z from which a bounce that is far on an axis is beyond doubt there."""
+_FARTHEST_MOVE_RAD = 1.0
+"""A direct place that the bounce moves by more is another one."""
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """What a bounce adds to a direct path on one axis, for G distances.
+
+    Parameters
+    ----------
+    distance
+        (G,) d, px.
+    table
+        (2T, G) real, then imaginary parts of √g e^{iωd} less what amplitude and place of the direct path can take of
+        it, of unit length.
+    length
+        (G,) its length before.
+    taken
+        (2, G) how much of amplitude, and of a₁ δu, a bounce of unit amplitude takes from the direct path.
+    """
+
+    distance: Reals
+    table: Reals
+    length: Reals
+    taken: Reals
+
+    @classmethod
+    def of(cls, comb: Comb) -> Profiles:
+        """All distances up to 1/(TΔf), the least at which the modulation varies by a whole period."""
+        omega = comb.carrier * (1 + comb.xi)
+        reach = 2 * math.pi / (omega.size * comb.carrier * comb.step_rad)
+        half = np.arange(_CLOSEST_RAD, reach * comb.carrier, _STEP_RAD) / comb.carrier
+        distance = np.concatenate([-half[::-1], half])
+        root = comb.gain[:, None]
+        wave = root * np.exp(1j * omega[:, None] * distance)
+        place = root * omega[:, None]
+        by_amplitude = (root * wave.real).sum(0) / (root**2).sum()
+        by_place = (place * wave.imag).sum(0) / (place**2).sum()
+        rest = np.concatenate([wave.real - root * by_amplitude, wave.imag - place * by_place])
+        length = np.sqrt((rest**2).sum(0))
+        return cls(distance, np.ascontiguousarray(rest / length), length, np.stack([by_amplitude, by_place]))
+
+    @property
+    def arrays(self) -> tuple[Reals, Reals, Reals, Reals]:
+        """As the kernel takes them."""
+        return self.distance, self.table, self.length, self.taken
+
+
+@compiled  # pragma: no cover
+def _insert(found: Reals, first: int, count: int, most: int, key: int, row: Reals) -> int:
+    """Put a row into the list ``found[first:count]``, which ascends in its column ``key``; returns the new count."""
+    if count - first == most:
+        if not row[key] < found[count - 1, key]:
+            return count
+        count -= 1
+    place = count
+    while place > first and row[key] < found[place - 1, key]:
+        for m in range(row.size):
+            found[place, m] = found[place - 1, m]
+        place -= 1
+    for m in range(row.size):
+        found[place, m] = row[m]
+    return count + 1
+
+
+@compiled  # pragma: no cover
+def _far_bounce(x: Reals, gain: Reals, sigma: float, omega0: float, step: float, d: float, s0: float, s2: float) -> Any:
+    """What `Profiles` says about one distance: power, length, and what it takes of amplitude and place."""
+    count = gain.size
+    e, turn = rotation(omega0 * d), rotation(step * d)
+    c0 = c1 = along = 0.0
+    for t in range(count):
+        root, omega = gain[t] / sigma, omega0 + t * step
+        c0 += root * root * e.real
+        c1 += root * root * omega * e.imag
+        along += root * (x[t] * e.real + x[count + t] * e.imag)
+        e *= turn
+    by_amplitude, by_place = c0 / s0, c1 / s2
+    for t in range(count):
+        root, omega = gain[t] / sigma, omega0 + t * step
+        along -= root * (x[t] * by_amplitude + x[count + t] * omega * by_place)
+    length = math.sqrt(s0 - by_amplitude * c0 - by_place * c1)
+    return along / length, length, by_amplitude, by_place
+
+
+@compiled  # pragma: no cover
+def _places(
+    y: Phasors, gain: Reals, sigma: float, omega0: float, step: float, u1: float, u2: float, only_u2: bool,
+    distance: Reals, table: Reals, length: Reals, taken: Reals, x: Reals, power: Reals, row: Reals, found: Reals,
+    count: int, limit: float,
+) -> int:  # fmt: skip
+    """Places of the bounce about the direct place u₁ that are local maxima of the likelihood, as rows of ``found``.
+
+    A bounce at u₂ is one of them where the profiles do not reach it, and with ``only_u2`` the only one. Of a row: χ²,
+    u₁, u₂, a₁, a₂, information of a₂, room for the χ² of a pair, what a bounce of unit amplitude takes of a₁ δu. Places
+    of a χ² above ``limit`` are none. Returns the new number of rows; the first ``count`` stay.
+    """
+    e, turn = rotation(-omega0 * u1), rotation(-step * u1)
+    total = own = moved = s0 = s2 = 0.0
+    for t in range(y.size):
+        q, root, omega = e * y[t], gain[t] / sigma, omega0 + t * step
+        x[t], x[y.size + t] = root * q.real, root * q.imag
+        total += root * root * (q.real * q.real + q.imag * q.imag)
+        own += root * root * q.real
+        moved += root * root * omega * q.imag
+        s0 += root * root
+        s2 += root * root * omega * omega
+        e *= turn
+    own, moved = own / s0, moved / s2
+    total -= own * own * s0 + moved * moved * s2
+    last = 0 if only_u2 else distance.size - 1
+    if not only_u2:
+        for j in range(distance.size):
+            power[j] = 0.0
+        for k in range(2 * y.size):
+            for j in range(distance.size):
+                power[j] += x[k] * table[k, j]
+    first, floor = count, math.sqrt(max(total - limit, 0.0))
+    for j in range(last + 1):
+        if j == 0:
+            # In the place of the end of the profiles, which can be no maximum, the bounce that is beyond.
+            d = u2 - u1
+            if not abs(d) > distance[distance.size - 1]:
+                continue
+            amount, size, by_amplitude, by_place = _far_bounce(x, gain, sigma, omega0, step, d, s0, s2)
+        else:
+            if j == last or not (power[j] > floor and power[j] >= power[j - 1] and power[j] > power[j + 1]):
+                continue
+            if distance[j - 1] * distance[j + 1] < 0:
+                # Beside the gap about the direct path a maximum is none.
+                continue
+            d, amount, size = distance[j], power[j], length[j] / sigma
+            by_amplitude, by_place = taken[0, j], taken[1, j]
+        chi2, a2 = total - amount * amount, amount / size
+        a1 = own - a2 * by_amplitude
+        if not (amount > floor and a1 > 0):
+            continue
+        move = (moved - a2 * by_place) / a1
+        if not abs(move) * omega0 < _FARTHEST_MOVE_RAD:
+            continue
+        if chi2 + _HOPELESS_CHI2 < limit:
+            limit = chi2 + _HOPELESS_CHI2
+            floor = math.sqrt(max(total - limit, 0.0))
+        row[0], row[1], row[2], row[3] = chi2, u1 + move, u1 + d, a1
+        row[4], row[5], row[7] = a2, size * size, by_place
+        count = _insert(found, first, count, _PLACES, 0, row[:8])
+    return count
+
+
+@compiled  # pragma: no cover
+def nearby(
+    ya: Phasors, yb: Phasors, gain_a: Reals, gain_b: Reals, sigma_a: float, sigma_b: float, comb: Reals, theta: Reals,
+    chi2_of_theta: float, prior: Reals, distance_a: Reals, table_a: Reals, length_a: Reals, taken_a: Reals,
+    distance_b: Reals, table_b: Reals, length_b: Reals, taken_b: Reals, along: Reals, across: Reals, x: Reals,
+    power_a: Reals, power_b: Reals, row: Reals, posterior_a: Reals, posterior_b: Reals, known_a: int, known_b: int,
+    found: Reals, reach: int, per_fringe: int,
+) -> Any:  # fmt: skip
+    """Starts near the fit ``theta`` as rows (u₁, u₂, a₁, a₂ along and across) of ``found`` (NEARBY, 9); χ² is last.
+
+    The direct place is tried ``reach`` steps to either side, ``per_fringe`` of which are one fringe.
+    The arrays after ``prior`` are `Profiles.arrays` of both axes, and `workspace`. Returns how many starts there are,
+    and the new lengths of ``posterior_a`` and ``posterior_b``: χ², direct place on the axis, its σ, by place of the
+    bounce.
+    """
+    # A bounce that is far and clear leaves no room for another one.
+    clear_a = abs(theta[1] - theta[0]) > distance_a[-1] and theta[3] > _CLEAR_SIGMAS * sigma_a
+    clear_b = abs(theta[5] - theta[4]) > distance_b[-1] and theta[7] > _CLEAR_SIGMAS * sigma_b
+    if clear_a and clear_b:
+        return 0, known_a, known_b
+    limit = chi2_of_theta + _HOPELESS_CHI2
+    columns = _places(
+        yb, gain_b, sigma_b, comb[2], comb[3], theta[4], theta[5], clear_b, distance_b, table_b, length_b, taken_b,
+        x, power_b, row, across, 0, limit,
+    )  # fmt: skip
+    if columns == 0:
+        return 0, known_a, known_b
+    fringe = 2 * math.pi / (comb[0] + 0.5 * (ya.size - 1) * comb[1])
+    rows = 0
+    for number in range(1 if clear_a else 2 * reach + 1):
+        # The middle first; the line leaves the order across it no choice.
+        order = (-((number + 1) // 2) if number % 2 else number // 2) / per_fringe
+        rows = _places(
+            ya, gain_a, sigma_a, comb[0], comb[1], theta[0] + order * fringe, theta[1], clear_a, distance_a, table_a,
+            length_a, taken_a, x, power_a, row, along, rows, limit - across[0, 0],
+        )  # fmt: skip
+    kappa, count = math.exp(prior[4]), 0
+    for i in range(rows):
+        along[i, 6] = math.inf
+    for j in range(columns):
+        across[j, 6] = math.inf
+    for i in range(rows):
+        for j in range(columns):
+            if i >= _TRIED and j >= _TRIED:
+                break
+            if not along[i, 0] + across[j, 0] < limit:
+                break
+            a2, b2 = kappa * along[i, 4], across[j, 4]
+            spread = kappa * kappa / along[i, 5] + 1 / across[j, 5] + (prior[6] * max(a2, b2)) ** 2
+            chi2 = along[i, 0] + across[j, 0] + (a2 - b2) ** 2 / spread
+            if not chi2 < limit:
+                continue
+            along[i, 6], across[j, 6] = min(along[i, 6], chi2), min(across[j, 6], chi2)
+            for m in range(4):
+                row[m], row[4 + m] = along[i, 1 + m], across[j, 1 + m]
+            row[8] = chi2
+            count = _insert(found, 0, count, NEARBY, 8, row)
+    known_a = _posterior(along, rows, gain_a, sigma_a, comb[0], comb[1], posterior_a, known_a)
+    known_b = _posterior(across, columns, gain_b, sigma_b, comb[2], comb[3], posterior_b, known_b)
+    return count, known_a, known_b
+
+
+@compiled  # pragma: no cover
+def _posterior(
+    places: Reals, count: int, gain: Reals, sigma: float, omega0: float, step: float, posterior: Reals, known: int
+) -> int:  # fmt: skip
+    """Append χ², direct place and σ by each place of the bounce to ``posterior``; returns its new length."""
+    information = 0.0
+    for t in range(gain.size):
+        information += (gain[t] / sigma * (omega0 + t * step)) ** 2
+    for i in range(count):
+        if places[i, 6] < math.inf:
+            posterior[known, 0], posterior[known, 1] = places[i, 6], places[i, 1]
+            spread = 1 / information + places[i, 7] * places[i, 7] / places[i, 5]
+            posterior[known, 2] = math.sqrt(spread) / places[i, 3]
+            known += 1
+    return known
+
+
+def workspace(
+    profiles_a: Profiles, profiles_b: Profiles
+) -> tuple[Reals, Reals, Reals, Reals, Reals, Reals, Reals, Reals]:
+    """Arrays that `nearby` works in; one set a thread."""
+    longest = max(len(profiles_a.table), len(profiles_b.table))
+    return (
+        np.empty(((2 * _MOST_REACH + 1) * _PLACES, 8)),
+        np.empty((_PLACES, 8)),
+        np.empty(longest),
+        np.empty(profiles_a.distance.size),
+        np.empty(profiles_b.distance.size),
+        np.empty(9),
+        # Of three calls, two of which reach one step to either side.
+        np.empty(((2 * _MOST_REACH + 7) * _PLACES, 3)),
+        np.empty((3 * _PLACES, 3)),
+    )
