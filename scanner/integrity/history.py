@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import Pixels
-from scanner.integrity.agreement import Shown, same, standing_out
+from scanner.integrity.agreement import Rounding, Shown, same, standing_out
 from scanner.integrity.findings import AtOdds
 from scanner.integrity.sampling import Grid, Noise, gradients, grid
 from scanner.integrity.waveform import FEWEST, Reference, Waveform, free_harmonics, other_mean, series
@@ -169,7 +169,7 @@ class SequenceHistory:
             ]
             self._shown.append(shown)
 
-    def at_odds(self, shape: tuple[int, int]) -> list[AtOdds]:
+    def at_odds(self, shape: tuple[int, int], rounding: Rounding | None = None) -> list[AtOdds]:
         """Sequences of this round, one an axis at most, that contradict the others, once all were found good.
 
         To be asked again when they were taken again. One that comes out the same twice is believed: then another may be
@@ -179,6 +179,8 @@ class SequenceHistory:
         ----------
         shape
             Of a frame, (H, W).
+        rounding
+            Of the round's pictures (`scanner.patterns.Plan.rounding`); None where light has no steps.
         """
         shown = [s for s in self._shown if s.round == self._round]
         if self._wrong:
@@ -186,7 +188,7 @@ class SequenceHistory:
             found = [AtOdds(axis, frequency, what) for axis, frequency in self._wrong]
             self._wrong = []
             return found
-        sure = standing_out(shown, self._extent, grid(shape))
+        sure = standing_out(shown, self._extent, grid(shape), rounding)
         found = []
         for axis in self._extent:
             against = [(float(value), s) for value, s in zip(sure, shown, strict=True) if s.axis == axis and value > 1]
