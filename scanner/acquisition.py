@@ -516,7 +516,7 @@ class Acquisition:
     def _at_odds(self, number: int, plan: Plan, attempts: Mapping[int, int]) -> list[tuple[int, int]]:
         """Revoke sequences that the rest of their round contradicts; returns them, each with its next attempt."""
         again = []
-        for found in self._history.at_odds(self.bench.frame_format.shape):
+        for found in self._history.at_odds(self.bench.frame_format.shape, plan.rounding()):
             places = [(s.axis, s.frequency) for s in plan.sequences]
             sequence = places.index((found.axis, found.frequency))
             attempt = attempts[sequence]

@@ -280,6 +280,22 @@ class Plan:
             return np.rint(255 * np.asarray(light, np.float64)).astype(np.uint8)
         return nearest_levels(self.response, light)
 
+    def rounding(self) -> dict[tuple[Axis, float], NDArray[np.complex128]]:
+        """What whole grey levels add to the phasor of each projector pixel, as a share of its modulus.
+
+        By axis and frequency, (extent,); of fringes of one frequency without a carrier.
+        """
+        found: dict[tuple[Axis, float], NDArray[np.complex128]] = {}
+        for s in self.sequences:
+            if isinstance(s, ProfileSequence) or s.frequency is None or s.carrier is not None:
+                continue
+            light = np.stack([line.ravel() for line in s.light(self.size, self.mean, self.amplitude)])
+            levels = self.grey(light)
+            shown = levels / 255 if self.response is None else np.array(self.response)[levels]
+            transform = 2 / len(s) * np.exp(-1j * s.steps_rad)
+            found[s.axis, s.frequency] = transform @ (shown - light) / self.amplitude
+        return found
+
     def render(self, sequence: int) -> list[NDArray[np.uint8]]:
         """(height, width) 8-bit pictures of one sequence, in the grey levels whose light comes nearest."""
         width, height = self.size

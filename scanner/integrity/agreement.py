@@ -8,6 +8,9 @@ Two things are not to be taken for a fault. Bounces and depth edges fit no coord
 phases agree, and of these the majority; and what changes smoothly with the frequency is a bounce. And there is what
 makes all phases a little wrong, as gamma does with few steps, or the optics: a sequence is compared with the others
 of its round.
+
+And a picture has whole grey levels. What that moves a phase by is the same wherever the same projector pixel is seen:
+in a small region with little noise it may look like a fault. But it is known, and taken away as far as it is seen.
 """
 
 from __future__ import annotations
@@ -86,7 +89,13 @@ class Shown:
     sure: bool = False
 
 
-def standing_out(shown: Sequence[Shown], extent: Mapping[Axis, int], cells: Grid) -> NDArray[np.float64]:
+Rounding = Mapping[tuple[Axis, float], NDArray[np.complex128]]
+"""By axis and frequency, (extent,) what grey levels add to the phasor of each projector pixel, as a share of B."""
+
+
+def standing_out(
+    shown: Sequence[Shown], extent: Mapping[Axis, int], cells: Grid, rounding: Rounding | None = None
+) -> NDArray[np.float64]:
     """(S,) how surely each of the sequences of a round is at odds with the others; 0 where it is not, or does no harm.
 
     Parameters
@@ -97,6 +106,8 @@ def standing_out(shown: Sequence[Shown], extent: Mapping[Axis, int], cells: Grid
         Projector pixels along each axis.
     cells
         Where the pixels lie.
+    rounding
+        Of the pictures (`scanner.patterns.Plan.rounding`); None where light has no steps.
 
     Notes
     -----
@@ -106,7 +117,10 @@ def standing_out(shown: Sequence[Shown], extent: Mapping[Axis, int], cells: Grid
     axes = {axis: [i for i, s in enumerate(shown) if s.axis == axis] for axis in extent}
 
     def judged(smooth: bool) -> dict[Axis, _Judged]:
-        return {a: _judged([shown[i] for i in members], extent[a], cells, smooth) for a, members in axes.items()}
+        return {
+            a: _judged([shown[i] for i in members], extent[a], cells, rounding or {}, smooth)
+            for a, members in axes.items()
+        }
 
     found = judged(smooth=False)
     suspected = _odd(found, 1)
@@ -157,14 +171,14 @@ class _Judged:
         return np.asarray(self.energy / self.left[:, None])
 
 
-def _judged(shown: Sequence[Shown], extent: int, cells: Grid, smooth: bool) -> _Judged:
+def _judged(shown: Sequence[Shown], extent: int, cells: Grid, rounding: Rounding, smooth: bool) -> _Judged:
     nothing = _Judged(np.empty((0, cells.bands + 1)), np.empty((0, cells.bands + 1)), np.empty(0))
     if len(shown) < _FEWEST_FREQUENCIES:
         return nothing
     pixels = np.flatnonzero(np.logical_and.reduce([s.usable for s in shown]))
     if pixels.size < FEWEST:
         return nothing
-    residuals = _residuals(shown, pixels, extent, cells, smooth)
+    residuals = _residuals(shown, pixels, extent, cells, rounding, smooth)
     regions = _regions(cells, pixels)
     found = np.array([[_of_a_frame(one, there) for there in regions] for one in residuals])
     return _Judged(found[..., 0], found[..., 1], np.array([one.left for one in residuals]))
@@ -187,7 +201,7 @@ class _Residual:
 
 
 def _residuals(
-    shown: Sequence[Shown], pixels: NDArray[np.intp], extent: int, cells: Grid, smooth: bool
+    shown: Sequence[Shown], pixels: NDArray[np.intp], extent: int, cells: Grid, rounding: Rounding, smooth: bool
 ) -> list[_Residual]:
     """What each phase is off by from where the others have it (leave-one-out residuals of a linear fit).
 
@@ -206,7 +220,8 @@ def _residuals(
     noise = np.full((1, pixels.size), sigma, np.float32)
     phasors = AxisPhasors(shown[0].axis, frequency, np.ascontiguousarray(z[:, None]), 0.0)
     gain = modulation_trend(phasors, noise)
-    phases = 2 * np.pi * frequency[:, None] * unwrap(phasors, noise, extent, gain).u[0].astype(np.float64)
+    place = unwrap(phasors, noise, extent, gain).u[0].astype(np.float64)
+    phases = 2 * np.pi * frequency[:, None] * place
     turned = z * np.exp(-1j * phases) / sigma
     along, across = turned.real, turned.imag
     b = np.maximum(gain @ along / (gain @ gain), 0)
@@ -214,6 +229,9 @@ def _residuals(
     free = 1 + min(2, (len(shown) - 3) // 2) if smooth else 1
     basis = np.linalg.qr((gain * np.power.outer(frequency / frequency.mean(), [1, 0, 2][:free]).T).T)[0]
     across = across - basis @ (basis.T @ across)
+    rounded = np.stack([_at(place, rounding.get((s.axis, s.frequency))) for s in shown]) * np.exp(-1j * phases)
+    rounded = rounded.imag * gain[:, None] * b / sigma
+    rounded = rounded - basis @ (basis.T @ rounded)
     along = along - gain[:, None] * b
     left = 1 - np.square(basis).sum(axis=1)
     weight = np.square(gain * frequency) / np.square(gain * frequency).sum()
@@ -224,6 +242,8 @@ def _residuals(
     rest = np.square(across).sum(axis=0) + np.square(along).sum(axis=0) - across**2 / left[:, None]
     highest = float(chi2.isf(_REFUSED, degrees))
     agreeing = highest / float(chi2.ppf(_CLEAN, degrees))
+    clean = rest < np.minimum(agreeing * np.quantile(rest, _CLEAN, axis=1, keepdims=True), _MOST * highest)
+    across = across - _seen(across, rounded, clean) * rounded
     column = cells.columns_px[pixels]
     found = []
     for t, one in enumerate(shown):
@@ -233,7 +253,7 @@ def _residuals(
                 across[t] / np.sqrt(left[t]),
                 float(left[t]),
                 _shapes(phases[t], b, former),
-                asked[t] & (rest[t] < min(agreeing * np.quantile(rest[t], _CLEAN), _MOST * highest)),
+                asked[t] & clean[t],
                 column,
             )
         )
@@ -256,6 +276,22 @@ def _regions(cells: Grid, pixels: NDArray[np.intp]) -> list[NDArray[np.bool_]]:
     """Bands of rows, and everything: a torn frame is right in most of its rows."""
     band = cells.band[pixels]
     return [band == n for n in range(cells.bands)] + [np.ones(pixels.size, bool)]
+
+
+def _seen(across: NDArray[np.float64], rounded: NDArray[np.float64], agreeing: NDArray[np.bool_]) -> float:
+    """Share of what grey levels make of (T, P) ``across``, were they seen without any blur, that is in it.
+
+    It is the same for all sequences, of which a wrong one is one among many.
+    """
+    theirs = rounded[agreeing]
+    return float(np.clip(across[agreeing] @ theirs / np.maximum(theirs @ theirs, 1e-12), 0, 1))
+
+
+def _at(place: NDArray[np.float64], line: NDArray[np.complex128] | None) -> NDArray[np.complex128]:
+    """(P,) values of a (extent,) line between its pixels; 0 without a line."""
+    if line is None:
+        return np.zeros(place.size, np.complex128)
+    return np.asarray(np.interp(place, np.arange(line.size), line))
 
 
 def _of_a_frame(one: _Residual, there: NDArray[np.bool_]) -> tuple[float, float]:

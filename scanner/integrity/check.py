@@ -91,7 +91,14 @@ def check_sequence(
     reference = None
     if history and stepped < _OWN_REDUNDANCY:
         reference = history.reference(values[:stepped], valid)
-    waveform = fit(values[:stepped], valid, steps, reference, history.noise_dn if history else np.inf)
+    waveform = fit(
+        values[:stepped],
+        valid,
+        steps,
+        reference,
+        history.noise_dn if history else np.inf,
+        history.round_noise if history else None,
+    )
     found = np.full(count, np.nan)
     if not findings and reference is None and 3 < stepped < 6 and np.count_nonzero(valid) >= FEWEST:
         findings += wrong_steps(values[:stepped, valid], steps)

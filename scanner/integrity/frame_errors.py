@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanner.integrity.sampling import Grid
+from scanner.integrity.significance import highest_by_chance
 from scanner.integrity.waveform import HARMFUL, STEADY, Waveform, free_harmonics, next_harmonic
 
 _BY_CHANCE = 1e-9
@@ -37,9 +38,6 @@ def formed_excess(
     former
         (P,) the frame that was taken before the first one, DN; None where there was none.
     """
-    # Heavy, and not needed where the steps are few.
-    from scipy.stats import chi2
-
     count = len(steps_rad)
     z = waveform.z[waveform.usable].astype(np.complex128)
     b, phase, band = np.abs(z), np.angle(z), cells.band[waveform.usable]
@@ -73,7 +71,7 @@ def formed_excess(
             along = vectors[:, clear].T @ (free.T @ waveform.errors[n, there])
             error = own @ (vectors[:, clear] @ (along / values[clear]))
             energy = float((along**2 / values[clear]).sum()) * waveform.visible[n] / waveform.sigma_dn**2
-            certain = energy / float(chi2.isf(_BY_CHANCE, int(clear.sum())))
+            certain = energy / highest_by_chance(_BY_CHANCE, int(clear.sum()), waveform.noise)
             # A phase moves by (2/N) (e/B) sin(φ + δ), its noise is √(2/N) σ/B.
             moved = 2 / count * float(np.square(error * np.sin(phase[there] + steps_rad[n])).mean())
             harm = moved / waveform.sigma_dn**2 / (HARMFUL + steady)

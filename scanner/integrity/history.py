@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import Pixels
-from scanner.integrity.agreement import Shown, same, standing_out
+from scanner.integrity.agreement import Rounding, Shown, same, standing_out
 from scanner.integrity.findings import AtOdds
-from scanner.integrity.sampling import Grid, gradients, grid
+from scanner.integrity.sampling import Grid, Noise, gradients, grid
 from scanner.integrity.waveform import FEWEST, Reference, Waveform, free_harmonics, other_mean, series
 from scanner.patterns import Axis, FringeSequence
 
@@ -43,6 +43,8 @@ class SequenceHistory:
         Whether the projector has been found to respond linearly, and never otherwise.
     noise_dn
         Of a grey value in the sequences so far, DN; infinite before the first.
+    round_noise
+        The same of those of this round, in which the same pixels are lit; None before the first.
     latest
         (P,) the last frame of the latest sequence, good or not, at the sampled pixels.
 
@@ -68,6 +70,7 @@ class SequenceHistory:
     linear: bool = False
     _distorts: bool = False
     noise_dn: float = float("inf")
+    round_noise: Noise | None = None
     _extent: dict[Axis, int] = field(default_factory=dict)
     _known: dict[Axis, NDArray[np.float32]] = field(default_factory=dict)
     _levels: NDArray[np.float32] | None = None
@@ -103,6 +106,7 @@ class SequenceHistory:
             (height, width) projector pixels that the round lights; None for all.
         """
         self._round += 1
+        self.round_noise = None
         self._extent = {"x": size[0], "y": size[1]}
         self._mean = self._modulation = self._lit = self._levels = None
         self._means, self._known, self._contradicting = 0, {}, []
@@ -140,7 +144,9 @@ class SequenceHistory:
             # The last few weigh most: light drifts.
             self._means = min(self._means + 1, 8)
             self._mean = self._mean + (mean - self._mean) / np.float32(self._means)
-        self._noises.append(waveform.sigma_dn)
+        own = waveform.own_noise
+        self.round_noise = own if self.round_noise is None else own.joined(self.round_noise)
+        self._noises.append(own.sigma_dn)
         self.noise_dn = float(np.median(self._noises))
         found = waveform.linear()
         # Once found not to be linear, it never is: where bounces blur the fringes, they blur the harmonics out first.
@@ -163,7 +169,7 @@ class SequenceHistory:
             ]
             self._shown.append(shown)
 
-    def at_odds(self, shape: tuple[int, int]) -> list[AtOdds]:
+    def at_odds(self, shape: tuple[int, int], rounding: Rounding | None = None) -> list[AtOdds]:
         """Sequences of this round, one an axis at most, that contradict the others, once all were found good.
 
         To be asked again when they were taken again. One that comes out the same twice is believed: then another may be
@@ -173,6 +179,8 @@ class SequenceHistory:
         ----------
         shape
             Of a frame, (H, W).
+        rounding
+            Of the round's pictures (`scanner.patterns.Plan.rounding`); None where light has no steps.
         """
         shown = [s for s in self._shown if s.round == self._round]
         if self._wrong:
@@ -180,7 +188,7 @@ class SequenceHistory:
             found = [AtOdds(axis, frequency, what) for axis, frequency in self._wrong]
             self._wrong = []
             return found
-        sure = standing_out(shown, self._extent, grid(shape))
+        sure = standing_out(shown, self._extent, grid(shape), rounding)
         found = []
         for axis in self._extent:
             against = [(float(value), s) for value, s in zip(sure, shown, strict=True) if s.axis == axis and value > 1]

@@ -20,10 +20,40 @@ _TILES = (8, 4)
 _ENOUGH_WINDOWS = 20
 _NEARLY = 0.95
 
+_INNER, _INNER_SIGMAS = 0.9, 1.645
+"""Of a normal distribution so many lie within so many σ."""
+
+_EFFICIENCY = 0.64
+"""Degrees of freedom of the σ that this quantile tells, for each value: p (1 - p)/f² is the variance of a quantile."""
+
 _CONTRASTS = np.array([[1, 0, -1], [1, -2, 1]], np.float32) / np.sqrt(np.array([[2], [6]], np.float32))
 _ROUGH = np.einsum("ir,jc->ijrc", _CONTRASTS, _CONTRASTS).reshape(4, _WINDOW).T
 """What is left of a window without any sum of a function of the row and one of the column, as fringes along either axis
 are: four numbers, each with the standard deviation of the noise (after Immerkær, CVIU 64, 300 (1996))."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviation of the noise of a grey value, as measured.
+
+    Parameters
+    ----------
+    sigma_dn
+        DN.
+    freedom
+        Degrees of freedom: the variance is known as well as from so many independent values. Infinite where σ is given.
+    """
+
+    sigma_dn: float
+    freedom: float
+
+    def joined(self, other: Noise) -> Noise:
+        """What both measurements of the same noise say together."""
+        freedom = self.freedom + other.freedom
+        if not np.isfinite(freedom):
+            return self if self.freedom >= other.freedom else other
+        total = self.freedom * self.sigma_dn**2 + other.freedom * other.sigma_dn**2
+        return Noise(float(np.sqrt(total / freedom)), freedom)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +146,8 @@ def unsaturated(values: NDArray[np.float32], saturated_dn: int) -> NDArray[np.bo
     return np.asarray((brightest < saturated_dn) & ~np.repeat(near, _WINDOW))
 
 
-def noise_of(values: NDArray[np.float32], valid: NDArray[np.bool_], lit: NDArray[np.bool_], least: float) -> float:
-    """Standard deviation of the noise of (K, P) values, from what differs between neighbours; ``least`` at least.
+def noise_of(values: NDArray[np.float32], valid: NDArray[np.bool_], lit: NDArray[np.bool_], least: float) -> Noise:
+    """Noise of (K, P) independent values, from what differs between neighbours; ``least`` at least.
 
     Parameters
     ----------
@@ -132,13 +162,15 @@ def noise_of(values: NDArray[np.float32], valid: NDArray[np.bool_], lit: NDArray
     """
     rough = np.abs(values.reshape(len(values), -1, _WINDOW) @ _ROUGH)
     whole = valid.reshape(-1, _WINDOW).all(axis=1)
-    found = least
+    found, freedom = least, np.inf
     for windows in (whole, whole & (lit.reshape(-1, _WINDOW).sum(axis=1) > _WINDOW // 2)):
         if np.count_nonzero(windows) >= _ENOUGH_WINDOWS:
-            # Of a normal distribution, nine tenths lie within 1.645 σ. The rest may be faults; the median would not do,
-            # because what is cut off at black has hardly any noise.
-            found = max(found, float(np.quantile(rough[:, windows], 0.9)) / 1.645)
-    return found
+            # The outer tenth may be faults; the median would not do, because what is cut off at black has hardly any
+            # noise.
+            found = max(found, float(np.quantile(rough[:, windows], _INNER)) / _INNER_SIGMAS)
+            # The darkness has many windows, but what it says of the light is a lower bound.
+            freedom = _EFFICIENCY * rough[:, windows].size
+    return Noise(found, freedom)
 
 
 def gradients(z: NDArray[np.complex64]) -> NDArray[np.complex64]:

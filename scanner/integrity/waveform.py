@@ -8,12 +8,13 @@ c₄ by known ratios for any plausible response; what is left is an error.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.integrity.sampling import Grid, noise_of
+from scanner.integrity.sampling import Grid, Noise, noise_of
+from scanner.integrity.significance import UNCERTAIN_NOISE, beyond
 
 TOLERANCE = 0.6
 """Errors that change a coordinate by less than half of its noise, rms, are let pass: an error e of one frame of N
@@ -39,9 +40,6 @@ _LITTLE = 0.5
 """Less light than this share of what was taken for lit, and it was darkness that told the noise."""
 
 _MORE_NOISE = 1.25
-_FEWEST_OF_TILE = 40
-_SIGNIFICANT = 6.5
-_UNCERTAIN_NOISE = 0.3
 _LEAST_VISIBLE = 0.05
 _LINEAR = 0.03
 _DRIFT = 0.002
@@ -97,8 +95,10 @@ class Waveform:
         (P,) pixels with fringes that stand out of the noise, none of them saturated.
     clear_dn
         Modulation from which a pixel is usable, DN.
-    sigma_dn
-        Noise of one grey value, DN.
+    noise
+        Of one grey value, as it is to be judged by.
+    own_noise
+        What this sequence alone says of it.
     harmonics
         (K - 1, U) phasors of the harmonics 2..K at the usable pixels, DN; empty where they are not free.
     errors
@@ -111,10 +111,16 @@ class Waveform:
     z: NDArray[np.complex64]
     usable: NDArray[np.bool_]
     clear_dn: float
-    sigma_dn: float
+    noise: Noise
+    own_noise: Noise
     harmonics: NDArray[np.complex64]
     errors: NDArray[np.float32]
     visible: NDArray[np.float64]
+
+    @property
+    def sigma_dn(self) -> float:
+        """Noise of one grey value, DN."""
+        return self.noise.sigma_dn
 
     @property
     def share(self) -> float:
@@ -135,9 +141,9 @@ class Waveform:
         noise = 4 * self.sigma_dn**2 / len(self.visible)
         power = float(np.square(np.abs(self.harmonics[0])).mean())
         limit = (_LINEAR * float(np.abs(self.z[self.usable]).mean())) ** 2
-        if power - (1 - _UNCERTAIN_NOISE) * noise < limit:
+        if power - (1 - UNCERTAIN_NOISE) * noise < limit:
             return True
-        return False if power - (1 + _UNCERTAIN_NOISE) * noise > limit else None
+        return False if power - (1 + UNCERTAIN_NOISE) * noise > limit else None
 
 
 def fit(
@@ -146,6 +152,7 @@ def fit(
     steps_rad: NDArray[np.float64],
     reference: Reference | None = None,
     former_noise_dn: float = np.inf,
+    round_noise: Noise | None = None,
 ) -> Waveform:
     """Least squares of the waveform with the given steps.
 
@@ -161,6 +168,8 @@ def fit(
         The mean as other sequences have it; with few steps the noise is measured against it.
     former_noise_dn
         Noise of a grey value in the sequences before: an error that passes for noise must not hide itself.
+    round_noise
+        Noise that the sequences before showed in the same light: a few pixels alone tell it badly.
     """
     count = len(steps_rad)
     orders = free_harmonics(count)
@@ -173,30 +182,40 @@ def fit(
     modulation = np.abs(z)
     rest = unexplained.T @ values
 
-    def noise(lit: NDArray[np.bool_]) -> float:
+    most = _MORE_NOISE * former_noise_dn
+
+    def told(lit: NDArray[np.bool_]) -> Noise:
         if orders > 1 or (len(rest) and reference is None):
             return noise_of(rest, valid, lit, ROUNDING_DN)
         if reference is not None:
             against = (mean - reference.mean)[None]
-            found = noise_of(against, valid & reference.known, lit, 0.0) / reference.noise_gain(count)
-            return max(found, ROUNDING_DN)
-        # Three steps leave no residual. But the texture of an object changes mean and modulation alike.
-        contrast = float(np.median(modulation[lit] / np.maximum(mean[lit], 1))) if lit.any() else 0.0
-        found = noise_of((modulation - np.float32(contrast) * mean)[None], valid, lit, 0.0)
-        return max(found / float(np.sqrt((2 + contrast**2) / count)), ROUNDING_DN)
+            found = noise_of(against, valid & reference.known, lit, 0.0)
+            scale = reference.noise_gain(count)
+        else:
+            # Three steps leave no residual. But the texture of an object changes mean and modulation alike.
+            contrast = float(np.median(modulation[lit] / np.maximum(mean[lit], 1))) if lit.any() else 0.0
+            found = noise_of((modulation - np.float32(contrast) * mean)[None], valid, lit, 0.0)
+            scale = float(np.sqrt((2 + contrast**2) / count))
+        return replace(found, sigma_dn=max(found.sigma_dn / scale, ROUNDING_DN))
 
     lit = valid & (modulation > 0.25 * np.quantile(modulation, 0.9))
-    most = _MORE_NOISE * former_noise_dn
-    sigma = min(noise(lit), most)
+    own = told(lit)
+    own = replace(own, sigma_dn=min(own.sigma_dn, most))
     gain = _CLEAR * float(np.linalg.norm(solve[1]))
-    usable = valid & (modulation > gain * sigma)
+    usable = valid & (modulation > gain * own.sigma_dn)
     if 0 < np.count_nonzero(usable) < _LITTLE * np.count_nonzero(lit):
         # Nearly all was dark, and darkness has less noise than light.
         bright = usable & (modulation > 0.25 * np.quantile(modulation[usable], 0.9))
         former = former_noise_dn if np.isfinite(former_noise_dn) else 0.0
-        sigma = max(sigma, min(noise(bright), most), former)
-        usable = valid & (modulation > gain * sigma)
-    clear = gain * sigma
+        again = told(bright)
+        own = replace(again, sigma_dn=max(own.sigma_dn, min(again.sigma_dn, most), former))
+    noise = own
+    if round_noise is not None:
+        joined = own.joined(round_noise)
+        # Harmonics may pass for noise, and some frequencies show more of them.
+        noise = replace(joined, sigma_dn=max(own.sigma_dn, joined.sigma_dn))
+    clear = gain * noise.sigma_dn
+    usable = valid & (modulation > clear)
     visible = np.square(unexplained, dtype=np.float64).sum(axis=1)
     errors = np.empty((count, 0), np.float32)
     if len(rest) and usable.any():
@@ -206,7 +225,7 @@ def fit(
         rows = np.concatenate([solve[2 : 1 + orders], solve[2 + orders :]])
         both = rows @ values[:, usable]
         harmonics = both[: orders - 1] + np.complex64(1j) * both[orders - 1 :]
-    return Waveform(mean, z, usable, clear, sigma, harmonics, errors, visible)
+    return Waveform(mean, z, usable, clear, noise, own, harmonics, errors, visible)
 
 
 def series(steps_rad: NDArray[np.float64], orders: int) -> NDArray[np.float64]:
@@ -230,6 +249,7 @@ def excess(waveform: Waveform, cells: Grid) -> NDArray[np.float64]:
         noise=waveform.sigma_dn**2 / visible,
         let_pass=single + next_harmonic(waveform) ** 2 / 2 * brightness / visible**2,
         pixels=pixels,
+        freedom=waveform.noise.freedom,
     )
     found[waveform.visible < _LEAST_VISIBLE] = 0
     return found
@@ -251,6 +271,7 @@ def harmonic_excess(waveform: Waveform, cells: Grid) -> NDArray[np.float64]:
         noise=parts * waveform.sigma_dn**2,
         let_pass=parts / count * single + float(np.square(3 * np.abs(shares)).sum()) * brightness,
         pixels=pixels,
+        freedom=waveform.noise.freedom,
     )
 
 
@@ -305,7 +326,7 @@ def other_mean(waveform: Waveform, reference: Reference, count: int, cells: Grid
     single = count / 2 * ((TOLERANCE * waveform.sigma_dn) ** 2 + STEADY**2 * moments[1] / pixels) / count**2
     steady = (_DRIFT**2 + allowed**2 / 2) * moments[2] / pixels
     noise = (waveform.sigma_dn * reference.noise_gain(count)) ** 2
-    return beyond(moments[0] / pixels, noise, single + steady, pixels)
+    return beyond(moments[0] / pixels, noise, single + steady, pixels, waveform.noise.freedom)
 
 
 def _alias(z: NDArray[np.complex64], off: NDArray[np.float32], count: int) -> float:
@@ -315,34 +336,6 @@ def _alias(z: NDArray[np.complex64], off: NDArray[np.float32], count: int) -> fl
     # What goes with the phase itself is an error; it is fitted as well, lest a part of it should pass for a harmonic.
     shapes = np.stack([b] + [b * part for k in (1, count) for part in ((turn**k).real, (turn**k).imag)], axis=1)
     return min(float(np.hypot(*np.linalg.lstsq(shapes, off, rcond=1e-3)[0][3:])), _ALIAS[count])
-
-
-def beyond(
-    energy: NDArray[np.float64],
-    noise: NDArray[np.float64] | float,
-    let_pass: NDArray[np.float64],
-    pixels: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """(…, tiles + 1) mean square of an error over what may pass, unless it is not significant; above 1 is an alarm.
-
-    Parameters
-    ----------
-    energy
-        Mean square as measured, DN².
-    noise
-        What noise adds to it, DN².
-    let_pass
-        Mean square that does no harm, DN².
-    pixels
-        (tiles + 1,) over how many pixels it was taken.
-    """
-    harmful = (energy - noise) / (let_pass + _UNCERTAIN_NOISE * noise)
-    # The cube root of χ² is normal but for little (Wilson & Hilferty, PNAS 17, 684 (1931)).
-    spread = 2 / (9 * pixels)
-    significant = (np.cbrt(energy / noise) - (1 - spread)) / np.sqrt(spread) / _SIGNIFICANT
-    found = np.minimum(harmful, significant)
-    found[..., pixels < _FEWEST_OF_TILE] = 0
-    return np.asarray(found)
 
 
 def _counted(cells: Grid, usable: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ import pytest
 
 from scanner.integrity.agreement import Shown, same, standing_out
 from scanner.integrity.sampling import grid
-from scanner.patterns import phase_steps
+from scanner.patterns import Plan, phase_steps
 
 SHAPE = (48, 64)
 EXTENT = {"x": 320, "y": 200}
@@ -123,3 +123,48 @@ def test_two_takes_are_the_same_or_not():
     assert same(shown(first, MICRO[0]), shown(second, MICRO[0]))
     second[2] += 1.5 * 1.5 * np.sqrt(6)
     assert not same(shown(first, MICRO[0]), shown(second, MICRO[0]))
+
+
+def small_round(plan, seed, sigma, gain, wrong=0.0):
+    """The sequences of axis y that show a small region, as the pictures' grey levels make it; and the wrong one."""
+    random = np.random.default_rng(seed)
+    rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    u = random.uniform(5, 40) + random.uniform(2.2, 3.0) * rows + random.uniform(-0.2, 0.2) * columns
+    top, left, height, width = (random.integers(*span) for span in ((0, 24), (0, 34), (10, 26), (20, 30)))
+    inside = (rows >= top) & (rows < top + height) & (columns >= left) & (columns < left + width)
+    light = gain * (0.75 + 0.25 * np.sin(columns / 9)) * inside
+    chosen = [n for n, s in enumerate(plan.sequences) if s.axis == "y"]
+    spoilt, found = int(random.integers(len(chosen))), []
+    for t, n in enumerate(chosen):
+        sequence = plan.sequences[n]
+        lines = [picture[:, 0] / 255 for picture in plan.render(n)]
+        frames = np.stack([light * np.interp(u, np.arange(plan.size[1]), line) for line in lines])
+        frames += random.normal(0, sigma, frames.shape)
+        frames[1] += wrong * sigma * np.sqrt(len(frames)) * (t == spoilt)
+        z = grid(SHAPE).take_all(frames).T @ (2 / len(frames) * np.exp(-1j * sequence.steps_rad))
+        sigma_z = sigma * np.sqrt(2 / len(frames))
+        lit = grid(SHAPE).take(inside) > 0
+        found.append(Shown("y", sequence.frequency, z.astype(np.complex64), sigma_z, lit, 1))
+    return found, spoilt
+
+
+def test_grey_levels_of_the_pictures_are_no_fault():
+    # Four steps, hardly any noise, and a region that sees few projector rows: what rounding moves is no noise there.
+    plan = Plan((320, 200), tuple(phase_steps("y", f, 4) for f in MICRO))
+    levels = plan.rounding()
+    unaware = []
+    for seed in range(800, 812):
+        good, _ = small_round(plan, seed, sigma=0.5, gain=230)
+        assert standing_out(good, EXTENT, grid(SHAPE), levels).max() == 0
+        unaware.append(odds(good).max())
+    assert max(unaware) > 0
+
+
+def test_a_wrong_frame_is_found_beside_the_grey_levels():
+    # An error of one frame that moves the phases by 1.2 times their noise.
+    plan = Plan((320, 200), tuple(phase_steps("y", f, 4) for f in MICRO))
+    for seed in range(820, 828):
+        sequences, spoilt = small_round(plan, seed, sigma=0.5, gain=230, wrong=1.2)
+        found = standing_out(sequences, EXTENT, grid(SHAPE), plan.rounding())
+        assert found.argmax() == spoilt
+        assert found[spoilt] > 1

@@ -107,3 +107,29 @@ def test_rounding_noise_of_levels():
     steps = 2.2 * light ** (1 - 1 / 2.2) / 255
     expected = np.sqrt(np.mean(steps**2) / 12)
     assert quantisation_sigma(ProjectorResponse.power(2.2).light) == pytest.approx(expected, rel=0.03)
+
+
+@pytest.mark.parametrize("steps", [3, 4, 5, 12])
+@pytest.mark.parametrize("amplitude", [0.5, 0.3])
+def test_what_grey_levels_add_to_phasors(steps, amplitude):
+    frequencies = [(80 + t) / 1280 for t in range(9)]
+    plan = Plan((1280, 800), tuple(phase_steps("x", f, steps) for f in frequencies), 0.5, amplitude)
+    found = plan.rounding()
+    assert set(found) == {("x", f) for f in frequencies}
+    # Rounding errors are uniform; of an even number of steps those of opposite ones are opposite, and add up.
+    one = 1 / np.sqrt(12) / (255 * amplitude)
+    expected = one * np.sqrt((4 if steps % 2 == 0 else 2) / steps)
+    assert np.sqrt(np.mean(np.square(np.abs(list(found.values())))) / 2) == pytest.approx(expected, rel=0.15)
+    x = np.arange(1280)
+    for number, f in enumerate(frequencies):
+        pictures = np.stack([p[0] for p in plan.render(number)]) / 255
+        z = np.fft.fft(pictures, axis=0)[1] * 2 / steps * np.exp(-2j * np.pi / steps)
+        assert z / amplitude - np.exp(2j * np.pi * f * x) == pytest.approx(found["x", f], abs=1e-9)
+
+
+def test_grey_levels_of_a_corrected_projector():
+    response = ProjectorResponse.power(2.2)
+    plan = Plan((320, 200), (phase_steps("y", 1 / 13, 5),), 0.5, 0.5, response=response.values)
+    off = np.abs(plan.rounding()["y", 1 / 13]) / np.sqrt(2)
+    expected = quantisation_sigma(response.light) / 0.5 * np.sqrt(2 / 5)
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(expected, rel=0.25)
