@@ -41,9 +41,6 @@ _CLEAR_CHOICE = 2.0
 _CLEAR_PLACE = float(np.log(100))
 """With a rig its place must be a hundred times as likely as the next."""
 
-_LOCATED_PX = 4.0
-"""Largest σ of a bounce's place that still says who lights whom, projector px."""
-
 
 @dataclass(frozen=True)
 class Separated:
@@ -67,7 +64,7 @@ class Separated:
     off_line
         Whether two paths fit and neither lies on the epipolar line: a mirror shows the pixel something else.
     located
-        Whether the place that the bounce comes from is known as well: clear, and to a quarter of a fringe.
+        Whether the fringe orders and the choice are clear, corroborated or not.
     blur
         Predicted σ in units of what the same amplitude reaches alone, on the axis that carries the depth.
     """
@@ -157,7 +154,8 @@ def _together(
         trusted,
         found.third,
         ~plausible & ~found.third,
-        trusted & (best.sigma_bounce < _LOCATED_PX).all(axis=0),
+        # Who lights whom is said by many pixels together: there a doubted separation still counts.
+        clear,
         np.asarray(blur[found.along], np.float32),
     )
 
