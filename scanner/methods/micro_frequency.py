@@ -49,12 +49,12 @@ from scanner.methods.regional import (
 )
 from scanner.methods.separated import Separated, phasors_of, separate_region
 from scanner.methods.sufficiency import Evidence, weigh
+from scanner.methods.weak_bounces import without_ripples
 from scanner.patterns import Axis, Plan
 from scanner.phasors import RoundPhasors
 from scanner.pooling import one_path_residuals
 from scanner.regions import literal_mask
 from scanner.result import Flag, Maps
-from scanner.ripples import remove_ripples, shift_of
 from scanner.strays import strays
 
 FREQUENCIES = 9
@@ -123,7 +123,7 @@ class MicroFrequencyShifting:
         refused = detection.region | detection.depth_edge | detection.suspicious
         clean = usable & maps.valid & ~refused
         seen = usable & ~detection.region & ~detection.depth_edge
-        decoded, rippled = _without_ripples(frames, decoded, seen, clean, setup)
+        decoded, rippled = without_ripples(frames, decoded, seen, clean, setup)
         separated = separate_region(frames, decoded, detection, clean, setup)
         flags = first_flags(usable, frames.saturated, [u for u in (maps.x_p, maps.y_p) if u is not None])
         flags[detection.region] |= np.uint16(Flag.INTERREFLECTION)
@@ -230,7 +230,7 @@ class MicroFrequencyShifting:
             return replace(first, maps=replace(first.maps, lit=state.lit > 0), private=replace(private, regional=state))
         found, usable = one_path_maps(regional, decoded, setup)
         whole = usable & lit_here(lit, found.x_p, found.y_p)
-        decoded, rippled = _without_ripples(regional, decoded, whole, whole, setup)
+        decoded, rippled = without_ripples(regional, decoded, whole, whole, setup)
         if rippled.any():
             found, _ = one_path_maps(regional, decoded, setup)
         total, dof = misfit_statistic([d.coordinates for d in decoded.values()])
@@ -396,34 +396,6 @@ def _finished(maps: Maps, setup: Setup) -> Maps:
     )
     flags = np.where(lost, maps.flags | np.uint16(Flag.STRAY), maps.flags)
     return refuse_off_epipolar(replace(maps, x_p=x, y_p=y, sigma_x=sigma_x, sigma_y=sigma_y, flags=flags), setup.rig)
-
-
-def _without_ripples(
-    frames: RoundPhasors,
-    decoded: dict[Axis, DecodedAxis],
-    good: NDArray[np.bool_],
-    asked: NDArray[np.bool_],
-    setup: Setup,
-) -> tuple[dict[Axis, DecodedAxis], NDArray[np.bool_]]:
-    """Take the bounces that only neighbours show off the ``asked`` pixels, and off their phasors."""
-    if not setup.scan.remove_ripples:
-        return decoded, np.zeros(good.shape, bool)
-    smooth: dict[Axis, DecodedAxis] = {}
-    ripples: dict[Axis, NDArray[np.float32]] = {}
-    for axis, d in decoded.items():
-        extent = frames.plan.extent(axis)
-        coordinates, ripples[axis] = remove_ripples(
-            phasors_of(frames, axis), d.coordinates, d.sigma_z, d.gain, good, asked, extent
-        )
-        smooth[axis] = replace(d, coordinates=coordinates)
-    if len(ripples) == 2:
-        for axis, other in (AXES, AXES[::-1]):
-            # Both axes see the same bounce: what one shows and the other does not is still in the other's coordinate.
-            hidden = np.maximum(ripples[other] - ripples[axis], 0)
-            c = smooth[axis].coordinates
-            sigma = np.hypot(c.sigma, shift_of(hidden, phasors_of(frames, axis).frequency))
-            smooth[axis] = replace(smooth[axis], coordinates=replace(c, sigma=sigma))
-    return smooth, np.asarray(np.maximum.reduce(list(ripples.values())) > 0)
 
 
 def _put(plane: NDArray[np.float32], separated: Separated, values: NDArray[np.float32]) -> None:

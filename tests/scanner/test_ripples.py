@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from scanner.phasors import AxisPhasors
+from scanner.result import Flag
 from scanner.ripples import remove_ripples
 from scanner.unwrapping import unwrap
 
@@ -152,3 +153,29 @@ def test_too_few_frequencies_tell_no_distance():
     after, ripple = remove_ripples(found, before, sigma, np.ones(4), whole, whole, EXTENT)
     assert after is before
     assert not ripple.any()
+
+
+def test_among_matt_objects_five_times_fewer_coordinates_are_beyond_three_sigma(scan_simulated):
+    # The scene of the paper's third experiment from another side; one round.
+    scans = [
+        scan_simulated(
+            {"name": "objects", "pitch_deg": 20, "block_turn_deg": 36},
+            method="mfs1",
+            options={"remove_ripples": remove},
+            seed=5,
+            camera={"width_px": 400, "height_px": 300, "field_of_view_deg": 28.7, "exposure_us": 16_667},
+            transport={"photons": 300_000, "supersample": 2},
+        )
+        for remove in (False, True)
+    ]
+    for part in ("table", "block"):
+        beyond, errors = [], []
+        for maps, truth in scans:
+            asked = truth.places[part] & ~truth.edge & np.isfinite(truth.x_p) & np.isfinite(maps.x_p)
+            off = [np.abs(getattr(maps, f"{a}_p") - getattr(truth, f"{a}_p"))[asked] for a in "xy"]
+            sigma = [getattr(maps, f"sigma_{a}")[asked] for a in "xy"]
+            beyond.append(np.mean([(o > 3 * s).mean() for o, s in zip(off, sigma, strict=True)]))
+            errors.append(rms(np.minimum(off, 1.0)))
+        assert beyond[1] < beyond[0] / 5
+        assert errors[1] < 0.85 * errors[0]
+        assert any((maps.flags & Flag.RIPPLE).any() for maps, _ in scans[1:])
