@@ -163,8 +163,8 @@ def test_among_matt_objects_five_times_fewer_coordinates_are_beyond_three_sigma(
             method="mfs1",
             options={"remove_ripples": remove},
             seed=5,
-            camera={"width_px": 400, "height_px": 300, "field_of_view_deg": 28.7, "exposure_us": 16_667},
-            transport={"photons": 300_000, "supersample": 2},
+            camera={"width_px": 512, "height_px": 384, "field_of_view_deg": 28.7, "exposure_us": 16_667},
+            transport={"photons": 500_000, "supersample": 2},
         )
         for remove in (False, True)
     ]
