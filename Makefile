@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
+KERNELS := $(VENV)/.kernels
 BENCH  := $(VENV)/.bench-ready
 
 .PHONY: demo virtual-bench test lint bench soak clean help
@@ -15,18 +16,23 @@ $(READY): pyproject.toml
 	  || { echo "Python 3.11 or newer is needed; name it with: make PYTHON=python3.12 …" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+# Numba's cache sees the file of a kernel, not those of the functions it calls: what has changed is compiled anew.
+$(KERNELS): $(READY) $(shell grep -lE '^@(njit|_?compiled)' scanner/*.py scanner/*/*.py sim_backend/*.py)
+	@find scanner sim_backend \( -name '*.nbi' -o -name '*.nbc' \) -delete
 	$(BIN)/python -m scanner.kernels
 	@touch $@
 
-demo: $(READY)   ## scan the mirror scene on the simulated bench and compare MFS with TPS
+demo: $(KERNELS)   ## scan the mirror scene on the simulated bench and compare MFS with TPS
 	$(BIN)/scan --config configs/demo.yaml --out demo-result --overwrite
 	$(BIN)/scan compare --config configs/demo.yaml --methods mfs,tps --reuse demo-result --out demo-comparison --overwrite
 
 # The real drivers need a virtual X server and a C compiler here; where one is missing, the error names what to install.
-virtual-bench: $(READY)  ## the same scan through the real drivers: window, GenICam camera and trigger box, emulated below
+virtual-bench: $(KERNELS)  ## the same scan through the real drivers: window, GenICam camera and trigger box, emulated below
 	$(BIN)/scan --config configs/virtual_bench.yaml --out virtual-bench-result --overwrite
 
-test: lint       ## lint, types, arrows and every test
+test: lint $(KERNELS)       ## lint, types, arrows and every test
 	$(BIN)/python -m pytest -m 'not bench and not alone' -n logical --maxprocesses 4 --dist loadfile
 	$(BIN)/python -m pytest -m 'alone and not bench'
 
@@ -37,7 +43,7 @@ lint: $(READY)   ## style, types, and who may import whom
 	$(BIN)/lint-imports
 
 # The peer package brings a second OpenCV of its own: it is installed without its dependencies.
-$(BENCH): $(READY)
+$(BENCH): $(KERNELS)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check scikit-image sympy pyyaml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'Fringes>=2.1'
 	@touch $@
@@ -45,7 +51,7 @@ $(BENCH): $(READY)
 bench: $(BENCH)  ## speed, as ratios to a peer and to reading the frames once
 	$(BIN)/python -m pytest tests/benchmarks -m bench -s
 
-soak: $(READY)   ## two thousand scans' worth of sequences with random faults
+soak: $(KERNELS)   ## two thousand scans' worth of sequences with random faults
 	$(BIN)/python -m pytest tests/test_soak.py -m bench -s
 
 clean:           ## forget the environment and the demo's output

@@ -6,6 +6,7 @@ test of its own fringes needs to notice. On a surface, however narrow, some of t
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -17,7 +18,10 @@ _FEWEST = 3
 """Neighbours that go on with a coordinate: a line one pixel wide has two, its end one."""
 
 _NEAR_PX = 3.0
-"""A neighbour goes on with it up to this and twice the usual distance, px."""
+"""A neighbour goes on with it up to this and twice the distance that is usual around, px."""
+
+_AROUND_PX = 5
+"""Side of what counts as around, camera px: a face that is seen at a grazing angle has its own usual distance."""
 
 _ROUNDS = 2
 """Two or three strays side by side are neighbours of each other, until the first of them is gone."""
@@ -32,7 +36,7 @@ def strays(x: NDArray[np.float32] | None, y: NDArray[np.float32] | None) -> NDAr
         (H, W) projector coordinates, px, NaN where there is none; None where the axis was not projected.
     """
     planes = [np.ascontiguousarray(u, np.float32) for u in (x, y) if u is not None]
-    limit = np.float32(_NEAR_PX + 2 * max(pitch(u, u) for u in planes))
+    limit = _NEAR_PX + 2 * np.maximum.reduce([_usual_step(u) for u in planes])
     first, second = planes[0], planes[-1]
     known = np.isfinite(first) & np.isfinite(second)
     kept = known.copy()
@@ -40,6 +44,17 @@ def strays(x: NDArray[np.float32] | None, y: NDArray[np.float32] | None) -> NDAr
         before, kept = kept, np.zeros_like(kept)
         over_rows(lambda a, b: _continued(first, second, before, limit, kept, a, b), len(first))  # noqa: B023
     return known & ~kept
+
+
+def _usual_step(u: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W) distance from neighbour to neighbour that is usual around a pixel, in the steeper direction, px."""
+    usual = np.full(u.shape, pitch(u, u), np.float32)
+    for axis in (0, 1):
+        # The last pixel has the step of the one before it.
+        step = np.pad(np.abs(np.diff(u, axis=axis)), [(0, int(k == axis)) for k in (0, 1)], mode="edge")
+        around = cv2.medianBlur(np.nan_to_num(step, nan=0.0), _AROUND_PX)
+        usual = np.maximum(usual, around)
+    return usual
 
 
 @njit(cache=True, nogil=True)
@@ -52,7 +67,7 @@ def _continued(x, y, known, limit, kept, start, stop):  # type: ignore[no-untype
             count = 0
             for k in range(max(i - 1, 0), min(i + 2, height)):
                 for m in range(max(j - 1, 0), min(j + 2, width)):
-                    if known[k, m] and abs(x[k, m] - x[i, j]) < limit and abs(y[k, m] - y[i, j]) < limit:
+                    if known[k, m] and abs(x[k, m] - x[i, j]) < limit[i, j] and abs(y[k, m] - y[i, j]) < limit[i, j]:
                         count += 1
             # The pixel itself is one of them.
             kept[i, j] = count > _FEWEST

@@ -2,7 +2,7 @@
 
 One axis, *along*, is that which the epipolar line runs along; the other is *across*.
 
-Numba's cache of `joint_block` does not see this file: whoever changes it clears the cache.
+Numba's cache of `joint_block` does not see this file: `make` compiles it anew.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Hypotheses of both axes together: which are worth a refinement, and how likely each is; see `scanner.paths.joint`.
 
-Numba's cache of `joint_block` does not see this file: whoever changes it clears the cache.
+Numba's cache of `joint_block` does not see this file: `make` compiles it anew.
 """
 
 from __future__ import annotations

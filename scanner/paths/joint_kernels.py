@@ -118,9 +118,9 @@ def joint_block(
                 if leads_to_known(thetas, steps[tried], scores, tried, first, _SAME_START_PX):
                     continue
                 if propose(
-                ya, wa, yb, wb, comb, thetas, priors, normals, gradients, chi2s, promised, steps, scores, factor, step,
-                nothing, tried, least,
-            ):  # fmt: skip
+                    ya, wa, yb, wb, comb, thetas, priors, normals, gradients, chi2s, promised, steps, scores, factor,
+                    step, nothing, tried, least,
+                ):  # fmt: skip
                     tried += 1
             least = refine(
                 ya, wa, yb, wb, comb, thetas, priors, normals, gradients, chi2s, promised, steps, scores, factor, step,

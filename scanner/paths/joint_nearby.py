@@ -9,7 +9,7 @@ so that the power which a bounce at distance d explains beyond the direct path i
 depends on the plan alone. All distances up to a period of the comb are looked at, and the direct place one fringe to
 either side as well: the minima of χ² that the fits of `scanner.paths.joint_seeds` do not lead to.
 
-Numba's cache of `joint_block` does not see this file: whoever changes it clears the cache.
+Numba's cache of `joint_block` does not see this file: `make` compiles it anew.
 """
 
 from __future__ import annotations

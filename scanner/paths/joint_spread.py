@@ -3,7 +3,7 @@
 The inverse Fisher matrix at a minimum of χ² knows of no other minimum. A σ is therefore so wide that of the posterior
 of all the fits that were found at a direct place, each normal about its own, next to nothing lies outside 3σ.
 
-Numba's cache of `joint_block` does not see this file: whoever changes it clears the cache.
+Numba's cache of `joint_block` does not see this file: `make` compiles it anew.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Matrix pencil in real arithmetic: unitary ESPRIT (Haardt & Nossek, IEEE Trans. Signal Process. 43, 1995).
 
-Numba's cache of the kernels that call `poles` does not see this file: whoever changes it clears the cache.
+Numba's cache of the kernels that call `poles` does not see this file: `make` compiles it anew.
 """
 
 from __future__ import annotations

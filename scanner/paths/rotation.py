@@ -1,6 +1,6 @@
 """Points of the unit circle for the kernels of the separation, three times as fast as two calls of the C library.
 
-Numba's cache of a kernel does not see this file: whoever changes what `rotation` returns clears the cache.
+Numba's cache of a kernel does not see this file: `make` compiles them anew.
 """
 
 from __future__ import annotations

@@ -10,8 +10,7 @@ would take for a shift. The wave is told from everything that the surface itself
 all frequencies alike, albedo scales them alike, creases and borders do both, and all of them therefore lie at Δu = 0;
 over the frequencies the phase of a bounce turns by 2πΔf Δu. Only waves from a place well apart are taken off.
 
-The same idea for one pair of frequencies and no distance is single-sideband demodulation; for the test against noise
-see Kay, *Fundamentals of Statistical Signal Processing II: Detection Theory*, §7.6.
+The test against noise is that of Kay, *Fundamentals of Statistical Signal Processing II: Detection Theory*, §7.6.
 """
 
 from scanner.ripples.removal import compile_all, remove_ripples, shift_of

@@ -16,7 +16,7 @@ from scanner.ripples.fitting import FASTEST, FINENESS, GROUPS, MOST_WAVES, fit_w
 from scanner.ripples.surface import STRIDE, TERMS, WINDOW, compiled, terms
 from scanner.unwrapping import Coordinates
 
-FEWEST_FREQUENCIES = 5
+_FEWEST_FREQUENCIES = 5
 """Fewer do not tell how far away a second path is."""
 
 _PASSES = 2
@@ -58,7 +58,7 @@ def remove_ripples(
     """
     ripple = np.zeros(good.shape, np.float32)
     frequency = phasors.frequency.astype(np.float64)
-    if len(frequency) < FEWEST_FREQUENCIES or not (good & asked).any():
+    if len(frequency) < _FEWEST_FREQUENCIES or not (good & asked).any():
         return coordinates, ripple
     gaps = np.diff(np.sort(frequency))
     reach = min(float(extent), 0.5 / float(gaps[gaps > 0].min(initial=np.inf)))
@@ -196,6 +196,7 @@ def _found(
 
 
 def _everywhere(what: tuple[Any, ...], results: tuple[NDArray[Any], ...]) -> None:
+    """Run `_remove` over the picture, on all cores."""
     over_rows(lambda a, b: _remove(*what, *results, a, b), results[0].shape[0])  # type: ignore[call-arg]
 
 

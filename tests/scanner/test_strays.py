@@ -36,3 +36,13 @@ def test_what_is_missing_is_no_stray():
     found = strays(x, y)
     assert found[4, 4]
     assert found.sum() == 1
+
+
+def test_a_steep_face_beside_a_flat_one_is_none():
+    # Seen at a grazing angle a pixel spans many times the usual step, along one direction only.
+    x, y = plane()
+    x[:, 20:] = x[:, 20:21] + 9 * np.arange(20)
+    assert not strays(x, y).any()
+    assert not strays(x.T.copy(), y.T.copy()).any()
+    x[11, 30] += 40
+    assert np.argwhere(strays(x, y)).tolist() == [[11, 30]]
