@@ -279,7 +279,8 @@ class MicroFrequencyShifting:
         )
         flags[passed & rippled] |= np.uint16(Flag.RIPPLE)
         # With fewer bounces than round one, the sequence still sees one: round one's coordinate cannot stand either.
-        refuted = target & ~region & usable & here & ~fits & (state.sequence == 0)
+        there = lit_here(lit, first.maps.x_p, first.maps.y_p)
+        refuted = target & ~region & usable & there & ~fits & (state.sequence == 0)
         flags[refuted] |= np.uint16(Flag.MISFIT)
         one = first.maps
 

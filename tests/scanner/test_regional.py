@@ -16,6 +16,8 @@ from scanner.acquisition import Acquisition
 from scanner.config import GatesSection, ScanSection
 from scanner.decoding import Decoder
 from scanner.methods import METHODS
+from scanner.methods.base import Setup
+from scanner.patterns import Plan
 from scanner.processing import process_take
 from scanner.result import Flag
 from scanner.take import Take, TakeWriter
@@ -96,6 +98,35 @@ def test_the_recording_of_several_sequences_processes_to_the_same(both):
         np.testing.assert_array_equal(getattr(again.maps, name), getattr(job.decoder.maps, name))
     assert list(again.summary["frames"].values()) == [108, 108, 108]
     assert "2 regional sequences" in again.summary["rounds"]
+
+
+def test_what_a_regional_sequence_refuses_beside_the_region_is_not_kept_from_round_one(both):
+    _, job, folder = both
+    take, method = Take.open(folder / "take"), METHODS["mfs"]
+    rounds = []
+    for number in (1, 2):
+        rounds.append(method.collect(Plan.from_json(take.rounds[number]), take.frame_format))
+        for sequence in range(len(take.rounds[number]["sequences"])):
+            rounds[-1].add(sequence, take.frames(number, sequence))
+    # A path from one place everywhere would be taken off as a ripple.
+    setup = Setup(job.scan.model_copy(update={"remove_ripples": False}), job.bench.noise, None)
+    first = method.decode(rounds[0], setup)
+    undisturbed = method.join(first, rounds[1], setup).maps
+    beside = ((undisturbed.flags & Flag.SECOND_ROUND) > 0) & ~undisturbed.interreflection
+    assert beside.sum() > 100
+    # Now the sequence shows a second path in all of these, and round one none.
+    first = method.decode(rounds[0], setup)
+    for axis in ("x", "y"):
+        phasors = rounds[1].axis(axis)
+        phasors.z[:, beside] += (
+            0.5
+            * np.abs(phasors.z[:, beside])
+            * np.exp(2j * np.pi * phasors.frequency[:, None] * 700).astype(np.complex64)
+        )
+    maps = method.join(first, rounds[1], setup).maps
+    assert np.isnan(maps.x_p[beside]).mean() > 0.95
+    refused = beside & np.isnan(maps.x_p)
+    assert (maps.flags[refused] & (Flag.MISFIT | Flag.STRAY) > 0).all()
 
 
 @pytest.mark.parametrize("lost_in", [2, 3])
