@@ -18,10 +18,10 @@ Array = NDArray[Any]
 
 # In the order of painting: where a pixel carries several, the last one shows.
 _FLAGS: tuple[tuple[Flag, str, str], ...] = (
+    (Flag.RIPPLE, "#8fc7a6", "a bounce too weak for a pixel was taken off"),
     (Flag.INTERREFLECTION, "#f2a5a5", "a bounce was detected in round one"),
     (Flag.SECOND_ROUND, "#2f9e62", "measured in round two"),
     (Flag.SEPARATED, "#3a80c9", "from the two-path separation of round one"),
-    (Flag.RIPPLE, "#8fc7a6", "a bounce too weak for a pixel was taken off"),
     (Flag.DEPTH_EDGE, "#7d5fb8", "mixes two surfaces at a depth edge"),
     (Flag.STRAY, "#b0568f", "refused: hardly any neighbour goes on with it"),
     (Flag.OUT_OF_VOLUME, "#8d6e46", "refused: outside the projector picture, or not in front of the rig"),
