@@ -209,12 +209,15 @@ def _masks(
     nearest = _around(group, [np.where(np.isfinite(p), p, u) for p, u in zip(places, first, strict=True)])
     step = pitch(paths[0], paths[1])
     masks = []
+    doubtful = _direct_anyhow(separated)
     for k in range(int(group.max()) + 1):
         chosen, mine = group == k, between & (nearest == k)
         direct = []
-        for place, u, a in zip(places, paths[:2], AXES, strict=True):
+        for place, u, doubted, a in zip(places, paths[:2], doubtful, AXES, strict=True):
             # Where the fringe orders of both paths could not be told, the surface around them can.
             found = continued(u, chosen, mine) if a in separated.u else u[mine]
+            # Farther from it, many pixels that agree: a third path spoils a bounce sooner than the direct path.
+            found = np.where(np.isnan(found), doubted[mine], found)
             place[mine] = found
             direct.append(np.append(u[chosen], found))
         emitters = paths[2][chosen], paths[3][chosen]
@@ -224,6 +227,15 @@ def _masks(
         sources = paths[2][chosen & located], paths[3][chosen & located]
         masks.append(mask | (along & ~emitter_mask(*sources, size, _EMITTER_PX, step)))
     return places[0], places[1], np.where(np.isfinite(places[0]) | np.isfinite(places[1]), nearest, -1), masks
+
+
+def _direct_anyhow(separated: Separated) -> NDArray[np.float32]:
+    """(2, H, W) direct coordinates of all separated pixels, fitting or not, where they continue each other, px."""
+    found = np.full((2, *separated.shape), np.nan, np.float32)
+    if len(separated.u) == 2:
+        found.reshape(2, -1)[:, separated.pixels] = [separated.u[a] for a in AXES]
+        found[:, ~on_surface(found[0], found[1])] = np.nan
+    return found
 
 
 def _around(group: NDArray[np.int8], places: list[NDArray[np.float32]]) -> NDArray[np.int8]:
