@@ -103,7 +103,7 @@ def emitter_mask(
     return np.asarray(cv2.dilate(source.astype(np.uint8), _disc(int(np.ceil(reach_px)))) > 0)
 
 
-def between_paths(
+def towards_emitters(
     x: NDArray[np.float32],
     y: NDArray[np.float32],
     bounce_x: NDArray[np.float32],
@@ -111,9 +111,7 @@ def between_paths(
     size: tuple[int, int],
     reach_px: float,
 ) -> NDArray[np.bool_]:
-    """Projector pixels between a direct place and the emitter of its bounce, where these are near to each other.
-
-    Towards a fold both paths meet, and before they do they are too close for round one to see that there are two.
+    """Projector pixels from direct places half the way to the emitters of their bounces, where these are near.
 
     Parameters
     ----------
@@ -130,7 +128,7 @@ def between_paths(
         (height, width) bool.
     """
     near = np.hypot(bounce_x - x, bounce_y - y) <= reach_px
-    way = np.linspace(0, 1, int(np.ceil(reach_px)) + 1, dtype=np.float32)[:, None]
+    way = np.linspace(0, 0.5, int(np.ceil(reach_px / 2)) + 1, dtype=np.float32)[:, None]
     along = [(u[near] + way * (v[near] - u[near])).ravel() for u, v in ((x, bounce_x), (y, bounce_y))]
     return _close(_believed(_splat(along[0], along[1], size), 1), 1)
 

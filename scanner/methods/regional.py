@@ -16,10 +16,10 @@ from scipy.ndimage import distance_transform_edt
 
 from scanner.groups import group_places
 from scanner.interreflection import Detection
+from scanner.methods.fold import Fold
 from scanner.methods.separated import Separated
-from scanner.patterns import Axis
+from scanner.patterns import AXES
 from scanner.regions import (
-    between_paths,
     continued,
     emitter_mask,
     inside,
@@ -36,9 +36,6 @@ CLEARANCE_PX = 2
 
 _CLEARANCE_PITCHES = 2.0
 """And those within so many camera pixels of it by the camera's."""
-
-CLOSE_PATHS_PX = 32.0
-"""Two fringes: between paths nearer than this others may meet unseen."""
 
 MOST_SEQUENCES = 8
 """One bit of `Maps.lit_by` each."""
@@ -70,6 +67,8 @@ class Regional:
         (H, W) uint8, the sequence that is meant to measure the pixel, 0 for none.
     served
         (H, W) bool, undetected pixels whose coordinates the sequences may replace.
+    strip
+        (height, width) bool, what stays dark: places that nothing can measure and that still throw bounces.
     most
         Sequences at most.
     taken
@@ -93,6 +92,7 @@ class Regional:
     y: NDArray[np.float32]
     own: NDArray[np.uint8]
     served: NDArray[np.bool_]
+    strip: NDArray[np.bool_]
     most: int
     taken: int
     lit: NDArray[np.uint8]
@@ -113,6 +113,7 @@ class Regional:
             y=unknown,
             own=np.zeros(shape, np.uint8),
             served=no,
+            strip=np.zeros((size[1], size[0]), bool),
             most=0,
             taken=0,
             lit=np.zeros((size[1], size[0]), np.uint8),
@@ -133,6 +134,7 @@ class Regional:
 def begin(
     separated: Separated,
     detection: Detection,
+    fold: Fold,
     first: Maps,
     size: tuple[int, int],
     margin_px: float,
@@ -144,6 +146,8 @@ def begin(
     ----------
     separated, detection, first
         Round one: both paths in its region, and the coordinates outside.
+    fold
+        What lies at folds: its strip stays dark.
     size
         Projector (width, height), px.
     margin_px
@@ -157,12 +161,8 @@ def begin(
     located = plane(separated, separated.located.astype(np.float32)) == 1
     nothing = np.full(shape, np.nan, np.float32)
     one_x, one_y = (nothing if u is None else u for u in (first.x_p_round1, first.y_p_round1))
-    rim = detection.penumbra & first.valid
+    rim = detection.penumbra & first.valid & ~fold.blind
     both = len(separated.u) == 2
-    if both:
-        x, y, from_x, from_y = (p[known] for p in paths)
-        blind = between_paths(x, y, from_x, from_y, size, CLOSE_PATHS_PX)
-        rim |= first.valid & ~detection.region & ~detection.depth_edge & inside(blind, one_x, one_y, 0)
     group = np.where(known, np.int8(0), np.int8(-1))
     if both and most > 1:
         group[known] = -1
@@ -174,9 +174,11 @@ def begin(
         group = np.where(plausible(separated) & lit_together(*paths), np.int8(0), np.int8(-1))
     between = detection.region & (group < 0)
     x, y, group, masks = _masks(group, paths, located, between, rim, (one_x, one_y), separated, size, margin_px)
+    masks = [mask & ~fold.strip for mask in masks]
     return replace(
         Regional.nothing(shape, size),
         queue=tuple(masks) if masks and masks[0].any() else (),
+        strip=fold.strip,
         x=x,
         y=y,
         own=(group + 1).astype(np.uint8),
@@ -184,9 +186,6 @@ def begin(
         most=most,
         left=int(detection.region.sum()),
     )
-
-
-AXES: tuple[Axis, Axis] = ("x", "y")
 
 
 def _masks(
@@ -289,6 +288,7 @@ def again(
     x, y, group, masks = _masks(
         group, paths, located, between, nothing, (paths[0], paths[1]), separated, size, margin_px
     )
+    masks = [mask & ~regional.strip for mask in masks]
     new = np.isfinite(x)
     return replace(
         regional,

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from scanner.groups import group_places
-from scanner.regions import between_paths, emitter_mask
+from scanner.regions import emitter_mask, towards_emitters
 
 
 def square(left, top, side=64, step=1.5):
@@ -115,9 +115,11 @@ def test_an_emitter_is_where_many_bounces_come_from():
     assert not mask[:, 148:].any()
 
 
-def test_between_close_paths_others_meet_unseen():
+def test_from_close_paths_half_the_way_to_their_emitters():
     y, x = (a.ravel().astype(np.float32) for a in np.mgrid[50:90, 100:130])
-    mask = between_paths(x, y, 260 - x, y, (300, 200), 32)
-    assert mask[52:88, 122:138].all()
+    mask = towards_emitters(x, y, 260 - x, y, (300, 200), 32)
+    # Paths of this fold at 130 px are mirror images of each other.
+    assert mask[52:88, 116:129].all()
+    assert not mask[:, 132:].any()
     # Farther than 32 px apart nothing is said of what lies between.
     assert not mask[:, :110].any()
