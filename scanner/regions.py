@@ -103,15 +103,18 @@ def emitter_mask(
     return np.asarray(cv2.dilate(source.astype(np.uint8), _disc(int(np.ceil(reach_px)))) > 0)
 
 
-def towards_emitters(
+def between_paths(
     x: NDArray[np.float32],
     y: NDArray[np.float32],
     bounce_x: NDArray[np.float32],
     bounce_y: NDArray[np.float32],
     size: tuple[int, int],
     reach_px: float,
+    share: float = 1.0,
 ) -> NDArray[np.bool_]:
-    """Projector pixels from direct places half the way to the emitters of their bounces, where these are near.
+    """Projector pixels between a direct place and the emitter of its bounce, where these are near to each other.
+
+    Towards a fold both paths meet, and before they do they are too close for round one to see that there are two.
 
     Parameters
     ----------
@@ -121,6 +124,8 @@ def towards_emitters(
         Projector (width, height), px.
     reach_px
         Paths farther apart than this tell nothing.
+    share
+        How much of the way counts, from the direct place on; to the fold it is a half.
 
     Returns
     -------
@@ -128,7 +133,7 @@ def towards_emitters(
         (height, width) bool.
     """
     near = np.hypot(bounce_x - x, bounce_y - y) <= reach_px
-    way = np.linspace(0, 0.5, int(np.ceil(reach_px / 2)) + 1, dtype=np.float32)[:, None]
+    way = np.linspace(0, share, int(np.ceil(share * reach_px)) + 1, dtype=np.float32)[:, None]
     along = [(u[near] + way * (v[near] - u[near])).ravel() for u, v in ((x, bounce_x), (y, bounce_y))]
     return _close(_believed(_splat(along[0], along[1], size), 1), 1)
 

@@ -16,10 +16,11 @@ from scipy.ndimage import distance_transform_edt
 
 from scanner.groups import group_places
 from scanner.interreflection import Detection
-from scanner.methods.fold import Fold
+from scanner.methods.fold import CLOSE_PATHS_PX, Fold
 from scanner.methods.separated import Separated
 from scanner.patterns import AXES
 from scanner.regions import (
+    between_paths,
     continued,
     emitter_mask,
     inside,
@@ -161,8 +162,13 @@ def begin(
     located = plane(separated, separated.located.astype(np.float32)) == 1
     nothing = np.full(shape, np.nan, np.float32)
     one_x, one_y = (nothing if u is None else u for u in (first.x_p_round1, first.y_p_round1))
-    rim = detection.penumbra & first.valid & ~fold.blind
+    rim = detection.penumbra
     both = len(separated.u) == 2
+    if both:
+        x, y, from_x, from_y = (p[known] for p in paths)
+        close = between_paths(x, y, from_x, from_y, size, CLOSE_PATHS_PX)
+        rim = rim | (~detection.region & ~detection.depth_edge & inside(close, one_x, one_y, 0))
+    rim = rim & first.valid & ~fold.blind
     group = np.where(known, np.int8(0), np.int8(-1))
     if both and most > 1:
         group[known] = -1

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from scanner.groups import group_places
-from scanner.regions import emitter_mask, towards_emitters
+from scanner.regions import between_paths, emitter_mask
 
 
 def square(left, top, side=64, step=1.5):
@@ -115,11 +115,13 @@ def test_an_emitter_is_where_many_bounces_come_from():
     assert not mask[:, 148:].any()
 
 
-def test_from_close_paths_half_the_way_to_their_emitters():
+def test_between_close_paths_others_meet_unseen():
     y, x = (a.ravel().astype(np.float32) for a in np.mgrid[50:90, 100:130])
-    mask = towards_emitters(x, y, 260 - x, y, (300, 200), 32)
-    # Paths of this fold at 130 px are mirror images of each other.
-    assert mask[52:88, 116:129].all()
-    assert not mask[:, 132:].any()
+    mask = between_paths(x, y, 260 - x, y, (300, 200), 32)
+    assert mask[52:88, 122:138].all()
     # Farther than 32 px apart nothing is said of what lies between.
     assert not mask[:, :110].any()
+    # Paths of this fold at 130 px are mirror images of each other: half of the way ends there.
+    half = between_paths(x, y, 260 - x, y, (300, 200), 32, 0.5)
+    assert half[52:88, 116:129].all()
+    assert not half[:, 132:].any()
