@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scanner.interreflection import Detection
 from scanner.methods.separated import Separated
 from scanner.patterns import AXES
-from scanner.regions import between_paths, emitter_mask, inside, pitch
+from scanner.regions import LEAST_SURFACE, between_paths, emitter_mask, inside, pitch
 
 CLOSE_PATHS_PX = 32.0
 """Two fringes: as near to each other as this, and to a fold, bounces from all around mix."""
@@ -92,8 +92,9 @@ def find_folds(
 
     blind, sure = between(near), between(near & _mostly(near, separated, detection, step))
     count, labels = cv2.connectedComponents(blind.astype(np.uint8), connectivity=8)
-    share = np.bincount(labels[sure & blind], minlength=count) / np.maximum(np.bincount(labels.ravel()), 1)
-    blind &= (share >= _SURE)[labels]
+    area = np.bincount(labels.ravel(), minlength=count)
+    share = np.bincount(labels[sure & blind], minlength=count) / np.maximum(area, 1)
+    blind &= ((share >= _SURE) & (area >= LEAST_SURFACE))[labels]
     strip, beside = (emitter_mask(x[blind], y[blind], size, reach, step) for reach in (_BLUR_PX, CLOSE_PATHS_PX))
     return Fold(blind | (undetected & inside(strip, x, y, 0)), strip, beside)
 
