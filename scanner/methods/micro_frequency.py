@@ -123,7 +123,7 @@ class MicroFrequencyShifting:
         refused = detection.region | detection.depth_edge | detection.suspicious
         clean = usable & maps.valid & ~refused
         seen = usable & ~detection.region & ~detection.depth_edge
-        decoded, rippled = without_ripples(frames, decoded, seen, clean, setup)
+        decoded, rippled, told = without_ripples(frames, decoded, seen, clean, setup)
         separated = separate_region(frames, decoded, detection, clean, setup)
         fold = find_folds(separated, detection, maps.x_p, maps.y_p, frames.plan.size)
         separated = doubted_beside(fold, separated)
@@ -131,7 +131,7 @@ class MicroFrequencyShifting:
         flags[detection.region] |= np.uint16(Flag.INTERREFLECTION)
         flags[detection.depth_edge] |= np.uint16(Flag.DEPTH_EDGE)
         flags[detection.suspicious] |= np.uint16(Flag.MISFIT)
-        flags[rippled] |= np.uint16(Flag.RIPPLE)
+        flags[told] |= np.uint16(Flag.RIPPLE)
         flags[fold.blind] |= np.uint16(Flag.BLIND)
         planes: tuple[tuple[Axis, NDArray[np.float32] | None, NDArray[np.float32] | None], ...] = (
             ("x", maps.x_p, maps.sigma_x),
@@ -240,7 +240,7 @@ class MicroFrequencyShifting:
             return replace(first, maps=replace(first.maps, lit=state.lit > 0), private=replace(private, regional=state))
         found, usable = one_path_maps(regional, decoded, setup)
         whole = usable & lit_here(lit, found.x_p, found.y_p)
-        decoded, rippled = without_ripples(regional, decoded, whole, whole, setup)
+        decoded, rippled, told = without_ripples(regional, decoded, whole, whole, setup)
         if rippled.any():
             found, _ = one_path_maps(regional, decoded, setup)
         total, dof = misfit_statistic([d.coordinates for d in decoded.values()])
@@ -288,7 +288,7 @@ class MicroFrequencyShifting:
             | Flag.RIPPLE
             | Flag.STRAY
         )
-        flags[passed & rippled] |= np.uint16(Flag.RIPPLE)
+        flags[passed & told] |= np.uint16(Flag.RIPPLE)
         # With fewer bounces than round one, the sequence still sees one: round one's coordinate cannot stand either.
         there = lit_here(lit, first.maps.x_p, first.maps.y_p)
         refuted = target & ~region & usable & there & ~fits & (state.sequence == 0)
