@@ -43,11 +43,14 @@ PRIORS = 3
 REFUSED_ONE_IN = 1e4
 """Of good fits one in so many is refused by its own χ²."""
 
-_BLOCK = 1024
+_BLOCK = 256
+"""Pixels that a thread works on at a time: their hypotheses stay in its cache."""
 _SURE, _SURE_SIGMAS = 7.0, 4.0
 """A hypothesis of the axis along that is e⁷ times as likely as its rival and fits needs no other seed,"""
 _CLOSE_PX = 48.0
 """unless its paths lie nearer to each other than this, where the axis along mistakes the fringe orders."""
+_ANYHOW = -math.inf, math.inf, 0.0
+"""Least lead over a rival, most χ², and least distance along of a pixel that is decided now: each is."""
 _UNKNOWN_LINE_PX, _LEAST_LINE_PX = 0.1, 0.02
 """Error of a calibrated rig where the scan itself does not show it, and the least that is believed, px."""
 _UNKNOWN_RATIO, _LEAST_RATIO = 0.05, 0.01
@@ -238,7 +241,7 @@ def separate_jointly(
     profiles_a, profiles_b = Profiles.of(comb_a), Profiles.of(comb_b)
     dof = 2 * (len(a.frequency) + len(b.frequency)) - 8 + PRIORS
 
-    def decide(these: NDArray[np.intp], fits_across: Floats) -> None:
+    def decide(these: NDArray[np.intp], fits_across: Floats, undecided_if: tuple[float, float, float]) -> None:
         if not these.size:
             return
         z1, z2, s1, s2, first, place, rise = (_taken(v, these) for v in (za, zb, sigma_a, sigma_b, fits, other, slope))
@@ -253,8 +256,8 @@ def separate_jointly(
             seeds, lines, bounds = np.empty((count, most, 8)), np.empty((count, most, 3)), np.empty((count, most))
             seed_block(*data, first, place, rise, fits_across, prior, start, seeds, lines, bounds)
             joint_block(
-                *data, seeds, lines, bounds, prior, LARGER_IS_DIRECT, *profiles_a.arrays, *profiles_b.arrays,
-                *workspace(profiles_a, profiles_b), found, start,
+                *data, seeds, lines, bounds, prior, LARGER_IS_DIRECT, profiles_a.arrays, profiles_b.arrays,
+                workspace(profiles_a, profiles_b), undecided_if, found, start,
             )  # fmt: skip
 
         with ThreadPoolExecutor(CORES) as pool:
@@ -263,14 +266,15 @@ def separate_jointly(
 
     def ask_across(these: NDArray[np.intp]) -> None:
         fits_across = separate_candidates(b.z[:, these], b.frequency, b.sigma_z[these], b.extent, b.gain)
-        decide(these, fits_across)
+        decide(these, fits_across, _ANYHOW)
         third[these] |= _too_many(fits_across, len(b.frequency))
 
     third = _too_many(fits, len(a.frequency))
     far = np.abs(fits[0, 0] - fits[0, 1]) > _CLOSE_PX
-    decide(np.flatnonzero(far), np.empty((0, *fits.shape[1:]), np.float32))
+    limits = _SURE, dof + _SURE_SIGMAS * math.sqrt(2 * dof), _CLOSE_PX
+    decide(np.flatnonzero(far), np.empty((0, *fits.shape[1:]), np.float32), limits)
     confidence, chi2 = out[2 * FIELDS], out[FIELDS - 1]
-    sure = far & (confidence > _SURE) & (chi2 < dof + _SURE_SIGMAS * math.sqrt(2 * dof))
+    sure = far & (confidence > limits[0]) & (chi2 < limits[1])
     ask_across(np.flatnonzero(~(sure & (np.abs(out[0] - out[1]) > _CLOSE_PX))))
     order = [0, 1] if along == "x" else [1, 0]
     best, rival = (_pair(out[k * FIELDS : (k + 1) * FIELDS], order) for k in range(2))
