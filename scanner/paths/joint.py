@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 
 from scanner.paths.comb import prepare
-from scanner.paths.joint_kernels import FIELDS, ROWS, joint_block
+from scanner.paths.joint_kernels import FIELDS, ROWS, fit_workspace, joint_block
 from scanner.paths.joint_nearby import Profiles, workspace
-from scanner.paths.joint_seeds import PAIRS, seed_block
+from scanner.paths.joint_seeds import PAIRS, seed_block, seed_workspace
 from scanner.paths.kernels import Floats
 from scanner.paths.separation import CORES, separate_candidates
 from scanner.patterns import Axis
@@ -254,10 +254,11 @@ def separate_jointly(
                 z1, z2, s1, s2, comb_a.gain, comb_b.gain, comb, -0.5, a.extent - 0.5, -0.5, b.extent - 0.5,
             )  # fmt: skip
             seeds, lines, bounds = np.empty((count, most, 8)), np.empty((count, most, 3)), np.empty((count, most))
-            seed_block(*data, first, place, rise, fits_across, prior, start, seeds, lines, bounds)
+            work, near = seed_workspace(len(z1), len(z2), comb), workspace(profiles_a, profiles_b)
+            seed_block(*data, first, place, rise, fits_across, prior, start, work, seeds, lines, bounds)
             joint_block(
                 *data, seeds, lines, bounds, prior, LARGER_IS_DIRECT, profiles_a.arrays, profiles_b.arrays,
-                workspace(profiles_a, profiles_b), undecided_if, found, start,
+                near, fit_workspace(len(z1), len(z2), most, near), undecided_if, found, start,
             )  # fmt: skip
 
         with ThreadPoolExecutor(CORES) as pool:

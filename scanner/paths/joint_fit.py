@@ -72,7 +72,7 @@ def fold(y: Phasors, gain: Reals, sigma: float, omega0: float, step: float, fold
 
 
 @compiled  # pragma: no cover
-def _sums(folded: Reals, u1: float, u2: float) -> Any:
+def sums(folded: Reals, u1: float, u2: float) -> Any:
     """Weighted sums of one axis over its frequencies.
 
     With e_k = e^{-iωu_k} they are Σ g Re e₁y, Σ g Re e₂y, Σ gω Im e₁y, Σ gω Im e₂y, and of p = e₁ē₂
@@ -136,7 +136,7 @@ def normal_equations(along: Reals, across: Reals, prior: Reals, theta: Reals, sy
     """
     p, q, b, gp, gq = system[0], system[1], system[2:6], system[6], system[7]
     last, a1, a2 = along.shape[0] - 1, theta[2], theta[3]
-    c1, c2, f1, f2, m0, m1, m2 = _sums(along, theta[0], theta[1])
+    c1, c2, f1, f2, m0, m1, m2 = sums(along, theta[0], theta[1])
     power, s0, s2 = along[last, 0], along[last, 1], along[last, 2]
     p[0], p[1], q[0], q[1] = a2 * a2 * s2, s0, a1 * a1 * s2, s0
     # Re(conj(i ω a₁ e₁) e₂) = ω a₁ Im(conj(e₁) e₂), and the other way round.
@@ -145,7 +145,7 @@ def normal_equations(along: Reals, across: Reals, prior: Reals, theta: Reals, sy
     gp[1], gq[1] = c2 - a2 * s0 - a1 * m0, c1 - a1 * s0 - a2 * m0
     chi2 = power - a1 * (c1 + gq[1]) - a2 * (c2 + gp[1])
     last, b1, b2 = across.shape[0] - 1, theta[6], theta[7]
-    c1, c2, f1, f2, m0, m1, m2 = _sums(across, theta[4], theta[5])
+    c1, c2, f1, f2, m0, m1, m2 = sums(across, theta[4], theta[5])
     power, s0, s2 = across[last, 0], across[last, 1], across[last, 2]
     p[2], p[3], q[2], q[3] = b1 * b1 * s2, s0, b2 * b2 * s2, s0
     b[2, 2], b[2, 3], b[3, 2], b[3, 3] = b1 * b2 * m2, b1 * m1, -b2 * m1, m0

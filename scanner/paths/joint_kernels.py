@@ -10,13 +10,17 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.paths.joint_fit import Reals, fold, set_line
+from scanner.paths.joint_fit import Phasors, Reals, fold, set_line
 from scanner.paths.joint_hypotheses import HOPELESS_CHI2, apart, leads_to_known, propose, refine, rival
 from scanner.paths.joint_nearby import NEARBY, Profile, Workspace, nearby
 from scanner.paths.joint_spread import OUTSIDE, by_bounce, widened
 from scanner.paths.rotation import compiled
 
 Floats = NDArray[np.float32]
+FitWorkspace = tuple[
+    Phasors, Phasors, Reals, Reals, Reals, Reals, Reals, Reals, Reals, Reals, Reals, Reals, Reals, Reals, Reals, Reals,
+    Reals, Reals, Reals,
+]  # fmt: skip
 
 FIELDS = 17
 """Of a hypothesis: u₁, u₂, a₁, a₂ along the line and across it, the σ of all eight, χ²."""
@@ -34,34 +38,56 @@ _NEGLIGIBLE = 1e-3
 """Weight over that of the best from which a hypothesis says nothing about σ."""
 
 
+def fit_workspace(count_a: int, count_b: int, most: int, near: Workspace) -> FitWorkspace:
+    """Arrays that `joint_block` works in, of so many frequencies along and across and hypotheses; one set a thread."""
+    room = most + 3 * NEARBY
+    return (
+        np.empty(count_a, np.complex128),
+        np.empty(count_b, np.complex128),
+        np.empty((count_a // 2 + 2, 7)),
+        np.empty((count_b // 2 + 2, 7)),
+        np.empty((room, 8)),
+        np.empty((room, 8)),
+        np.empty((room, 8)),
+        np.empty((room, 7)),
+        np.zeros((room, 8, 4)),
+        np.empty(room),
+        np.empty(room),
+        np.empty(room),
+        np.empty(room),
+        np.empty(8),
+        np.zeros((8, 4)),
+        np.empty(room),
+        np.empty(room),
+        np.empty((NEARBY, 9)),
+        np.empty((max(room, len(near[8])), 3)),
+    )
+
+
 @compiled  # pragma: no cover
 def joint_block(
     za: NDArray[np.complex64], zb: NDArray[np.complex64], sigma_a: Reals, sigma_b: Reals, gain_a: Reals, gain_b: Reals,
     comb: Reals, low_a: float, high_a: float, low_b: float, high_b: float, seeds: Reals, lines: Reals, bounds: Reals,
-    prior: Reals, larger_is_direct: float, profile_a: Profile, profile_b: Profile, work: Workspace,
-    undecided_if: tuple[float, float, float], out: Floats, start: int,
+    prior: Reals, larger_is_direct: float, profile_a: Profile, profile_b: Profile, near: Workspace,
+    work: FitWorkspace, undecided_if: tuple[float, float, float], out: Floats, start: int,
 ) -> None:  # fmt: skip
     """The likeliest direct path of the pixels from ``start`` on, and its rival, as rows of ``out``.
 
     ``seeds``, ``lines``, ``bounds`` as `scanner.paths.joint_seeds.seed_block` leaves them; the profiles are
-    `Profiles.arrays` of both axes, ``work`` is `workspace` of `scanner.paths.joint_nearby`. A pixel stays without a
+    `Profiles.arrays` of both axes, ``near`` is `workspace` of `scanner.paths.joint_nearby` and
+    ``work`` `fit_workspace`. A pixel stays without a
     result where half the lead of its best hypothesis' score over a rival's, its χ² or its paths' distance along are
     below, above, below ``undecided_if``.
     """
-    posterior_a, posterior_b = work[8], work[9]
+    posterior_a, posterior_b = near[8], near[9]
     least_lead, most_chi2, least_apart = undecided_if
     count_a, count_b, most = za.shape[0], zb.shape[0], bounds.shape[1]
-    room = most + 3 * NEARBY
     dof = 2 * (count_a + count_b) - 5
     doubtful = dof + _DOUBTFUL_SIGMAS * math.sqrt(2.0 * dof)
-    ya, yb = np.empty(count_a, np.complex128), np.empty(count_b, np.complex128)
-    folded_a, folded_b = np.empty((count_a // 2 + 2, 7)), np.empty((count_b // 2 + 2, 7))
-    thetas, steps, variances = np.empty((room, 8)), np.empty((room, 8)), np.empty((room, 8))
-    priors, systems = np.empty((room, 7)), np.empty((room, 8, 4))
-    chi2s, gains, promised, scores = np.empty(room), np.empty(room), np.empty(room), np.empty(room)
-    trial, spare = np.empty(8), np.empty((8, 4))
-    weights, of_place, found = np.empty(room), np.empty(room), np.empty((NEARBY, 9))
-    mixture = np.empty((max(room, len(posterior_a)), 3))
+    (
+        ya, yb, folded_a, folded_b, thetas, steps, variances, priors, systems, chi2s, gains, promised, scores, trial,
+        spare, weights, of_place, found, mixture,
+    ) = work  # fmt: skip
     for n in range(bounds.shape[0]):
         p = start + n
         for t in range(count_a):
@@ -110,7 +136,7 @@ def joint_block(
             reach, per_fringe = _FARTHER if turn == 2 else _NEAR
             starts, known_a, known_b = nearby(
                 ya, yb, gain_a, gain_b, sigma_a[p], sigma_b[p], comb, thetas[about], chi2s[about], prior, profile_a,
-                profile_b, work, known_a, known_b, found, reach, per_fringe,
+                profile_b, near, known_a, known_b, found, reach, per_fringe,
             )  # fmt: skip
             first = tried
             for j in range(starts):

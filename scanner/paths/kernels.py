@@ -20,6 +20,7 @@ from scanner.paths.rotation import compiled, rotation
 Floats = NDArray[np.float32]
 Reals = NDArray[np.float64]
 Phasors = NDArray[np.complex128]
+Workspace = tuple[Phasors, Phasors, Reals, Reals, Reals, Reals, Reals]
 
 CANDIDATES = 3
 """Fits that are kept of a pixel, the best one first."""
@@ -224,7 +225,7 @@ def _strongest(y: Phasors, g: Reals, xi: Reals, low: float, high: float, step: f
 def _nearest(v: float, r: complex) -> float:
     """The coordinate nearest to v whose phase is that of the residue r."""
     off = math.atan2(r.imag, r.real) - v
-    return v + off - 2 * math.pi * round(off / (2 * math.pi))
+    return v + off - 2 * math.pi * math.floor(off * (0.5 / math.pi) + 0.5)
 
 
 @compiled  # pragma: no cover
@@ -336,16 +337,32 @@ def _keep(
     kept[place, 4], kept[place, 5], kept[place, 6] = a2, var_v, var_a
 
 
+def workspace(count: int) -> Workspace:
+    """Arrays that `separate_block` works in, of ``count`` frequencies; one set a thread."""
+    m = count // 2 + 1
+    return (
+        np.empty(count, np.complex128),
+        np.empty(count, np.complex128),
+        np.empty((m, m)),
+        np.empty((m, m)),
+        np.empty((4, m)),
+        np.empty((_REFINED, 3)),
+        np.empty((CANDIDATES, FIELDS)),
+    )
+
+
 @compiled  # pragma: no cover
 def separate_block(
     z: NDArray[np.complex64], sigma: Reals, gain: Reals, g: Reals, xi: Reals, unitary: Phasors, k1: Reals, k2: Reals,
     carrier: float, step_rad: float, turn: float, low: float, high: float, found: Floats, start: int, stop: int,
+    work: Workspace,
 ) -> None:  # fmt: skip
-    """Candidates of the pixels start..stop, written into ``found`` (CANDIDATES, 9, P) as `scanner.paths.separation`."""
-    count, m = z.shape[0], k1.shape[1]
-    y, left = np.empty(count, np.complex128), np.empty(count, np.complex128)
-    covariance, square, basis = np.empty((m, m)), np.empty((m, m)), np.empty((4, m))
-    seeds, kept = np.empty((_REFINED, 3)), np.empty((CANDIDATES, FIELDS))
+    """Candidates of the pixels start..stop, written into ``found`` (CANDIDATES, 9, P) as `scanner.paths.separation`.
+
+    ``work`` is `workspace`.
+    """
+    y, left, covariance, square, basis, seeds, kept = work
+    count = z.shape[0]
     dof = 2 * count - 4
     # 1/Δf and the width of a path in the spectrum of the comb, 1/(TΔf), as phases of the carrier.
     period = 2 * math.pi / step_rad

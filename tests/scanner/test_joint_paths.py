@@ -179,6 +179,27 @@ def test_different_numbers_of_frequencies():
     assert (np.abs(found.best.direct - s.u[0]) < 0.2).all(axis=0).mean() > 0.98
 
 
+def test_even_number_of_frequencies_and_a_trend_of_their_modulation():
+    s = signals(np.random.default_rng(87), 1000, (0.3, 0.6), 2, (142, 600), (100, 400))
+    trend = np.linspace(1, 0.5, 8)
+    axes = {}
+    for a, v in s.axes.items():
+        k = "xy".index(a)
+        clean = np.sum(s.amplitude[:, k] * np.exp(2j * np.pi * FREQUENCY[:8, None, None] * s.u[:, k]), axis=1)
+        # The noise stays as it is where the fringes are weaker.
+        z = trend[:, None] * clean + (v.z[:8] - clean)
+        axes[a] = AxisPhasorsOf(z.astype(np.complex64), FREQUENCY[:8], v.sigma_z, v.extent, trend)
+    found = separate_jointly(s.rig, s.pixels, axes, COUPLING)
+    assert found.dof == 2 * 16 - 8 + 3
+    clear = decided(found)
+    assert clear.mean() > 0.95
+    z = ((found.best.direct - s.u[0]) / found.best.sigma)[:, clear]
+    assert (np.abs(z) < 3).mean() >= 0.99
+    # The signals keep to the line and to the ratios more closely than the three priors ask; 3 standard errors.
+    slack = 3 * np.sqrt(2 * found.dof / clear.sum())
+    assert found.dof - 3 - slack < found.best.chi2[clear].mean() < found.dof + slack
+
+
 def test_no_pixels():
     s = signals(np.random.default_rng(85), 4, (0.3, 0.6), 2, (200, 600))
     none = {a: AxisPhasorsOf(v.z[:, :0], v.frequency, v.sigma_z[:0], v.extent, v.gain) for a, v in s.axes.items()}
