@@ -10,7 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.paths.joint_fit import Phasors, Reals, fold, set_line
+from scanner.paths.folding import COLUMNS, fold
+from scanner.paths.joint_fit import Phasors, Reals, set_line
 from scanner.paths.joint_hypotheses import HOPELESS_CHI2, apart, leads_to_known, propose, refine, rival
 from scanner.paths.joint_nearby import NEARBY, Profile, Workspace, nearby
 from scanner.paths.joint_spread import OUTSIDE, by_bounce, widened
@@ -44,8 +45,8 @@ def fit_workspace(count_a: int, count_b: int, most: int, near: Workspace) -> Fit
     return (
         np.empty(count_a, np.complex128),
         np.empty(count_b, np.complex128),
-        np.empty((count_a // 2 + 2, 7)),
-        np.empty((count_b // 2 + 2, 7)),
+        np.empty((count_a // 2 + 2, COLUMNS)),
+        np.empty((count_b // 2 + 2, COLUMNS)),
         np.empty((room, 8)),
         np.empty((room, 8)),
         np.empty((room, 8)),

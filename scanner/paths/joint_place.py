@@ -1,7 +1,7 @@
 """Where the one path lies that phasors hold; see `scanner.paths.joint_seeds`.
 
 The frequencies are equally spaced: what lies above the middle one is turned by as much as what lies below it is turned
-back, so that sums run over pairs of frequencies, as in `scanner.paths.joint_fit.fold`.
+back, so that sums run over pairs of frequencies, as in `scanner.paths.folding`.
 
 Numba's cache of `seed_block` does not see this file: `make` compiles it anew.
 """
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.paths.rotation import compiled, rotation
+from scanner.paths.rotation import angle_of, compiled, rotation
 
 Reals = NDArray[np.float64]
 Phasors = NDArray[np.complex128]
@@ -70,7 +70,7 @@ def lone_path(
     count, half = left.size, left.size // 2
     centre, per_step = omega0 + 0.5 * (count - 1) * step, 1 / step
     per_centre = 1 / centre
-    coarse = math.atan2(lag.imag, lag.real) * per_step
+    coarse = angle_of(lag) * per_step
     coarse -= _TURN * per_step * math.floor((coarse - 0.5 * (low + high)) * step * (1 / _TURN) + 0.5)
     # Of an odd comb the turn from one frequency to the next is that of the pole itself.
     turn = lag * (1 / max(math.sqrt(lag.real * lag.real + lag.imag * lag.imag), _TINY))
@@ -84,7 +84,7 @@ def lone_path(
         s, d = above + below, above - below
         c += complex(s.real * e.real + d.imag * e.imag, s.imag * e.real - d.real * e.imag)
         e *= turn
-    off = math.atan2(c.imag, c.real) - coarse * centre
+    off = angle_of(c) - coarse * centre
     off -= _TURN * math.floor(off * (1 / _TURN) + 0.5)
     fine = coarse + off * per_centre
     c *= 1 / max(math.sqrt(c.real * c.real + c.imag * c.imag), _TINY)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.paths.joint_fit import fold, sums
+from scanner.paths.folding import COLUMNS, fold, sums
 from scanner.paths.joint_place import ORDERS, lone_path, order_turns, wave_of
 from scanner.paths.rotation import compiled, rotation
 
@@ -50,7 +50,7 @@ def seed_workspace(count_a: int, count_b: int, comb: Reals) -> SeedWorkspace:
         np.empty(count_b),
         np.empty((PAIRS, 4)),
         np.empty((PAIRS, 3)),
-        np.empty((count_a // 2 + 2, 7)),
+        np.empty((count_a // 2 + 2, COLUMNS)),
         order_turns(count_a, comb[0], comb[1]),
         order_turns(count_b, comb[2], comb[3]),
     )

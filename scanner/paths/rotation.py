@@ -1,4 +1,4 @@
-"""Points of the unit circle for the kernels of the separation, three times as fast as two calls of the C library.
+"""Points of the unit circle, and their angles, for the kernels of the separation: faster than the C library's.
 
 Numba's cache of a kernel does not see this file: `make` compiles them anew.
 """
@@ -49,3 +49,22 @@ def rotation(angle: float) -> complex:
     cosine = 1 + q * (-1 / 2 + cosine)
     sine, cosine = 2 * sine * cosine, 1 - 2 * sine * sine
     return complex(1 - 2 * sine * sine, 2 * sine * cosine)
+
+
+@compiled  # pragma: no cover
+def angle_of(z: complex) -> float:
+    """Angle of a complex number to 2e-8 rad; 0 of zero.
+
+    Notes
+    -----
+    Hastings' polynomial (Abramowitz & Stegun, Handbook of Mathematical Functions, 1964, 4.4.49), without a branch.
+    """
+    x, y = abs(z.real), abs(z.imag)
+    t = min(x, y) / max(max(x, y), 1e-300)
+    q = t * t
+    high = 0.0429096138 + q * (-0.0161657367 + q * 0.0028662257)
+    high = -0.1420889944 + q * (0.1065626393 + q * (-0.0752896400 + q * high))
+    r = t * (1 + q * (-0.3333314528 + q * (0.1999355085 + q * high)))
+    r = 0.5 * math.pi - r if y > x else r
+    r = math.pi - r if z.real < 0 else r
+    return math.copysign(r, z.imag)

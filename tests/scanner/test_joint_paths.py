@@ -21,7 +21,7 @@ from scanner.paths import (
     measure_coupling,
     separate_jointly,
 )
-from scanner.paths.rotation import rotation
+from scanner.paths.rotation import angle_of, rotation
 from scanner.paths.twin import refine_jointly_twin
 from scanner.rig import Rig
 from scanner.triangulation import epipolar_crossings
@@ -76,6 +76,13 @@ def test_direct_path_where_noise_is_large_and_the_paths_are_close():
 def test_points_of_the_unit_circle():
     angles = np.concatenate([np.random.default_rng(82).uniform(-1e5, 1e5, 2000), np.arange(-16, 17) * np.pi / 8])
     assert max(abs(rotation(a) - np.exp(1j * a)) for a in angles) < 1e-10
+
+
+def test_angles_of_complex_numbers():
+    angles = np.concatenate([np.random.default_rng(83).uniform(-np.pi, np.pi, 2000), np.arange(-3, 5) * np.pi / 4])
+    scales = np.logspace(-6, 6, angles.size)
+    assert max(abs(angle_of(complex(z)) - a) for z, a in zip(scales * np.exp(1j * angles), angles, strict=True)) < 3e-8
+    assert angle_of(0j) == 0
 
 
 def test_larger_bounce_is_not_taken_for_direct_light():
