@@ -19,6 +19,7 @@ import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -231,7 +232,7 @@ def separate_jointly(
     a, b = axes[along], axes[across]
     fits = separate_candidates(a.z, a.frequency, a.sigma_z, a.extent, a.gain)
     places = fits[:, :2].reshape(2 * len(fits), pixels.size)
-    other, slope = epipolar_crossings(rig, pixels, places, along)
+    other, slope = (np.ascontiguousarray(v, np.float64) for v in epipolar_crossings(rig, pixels, places, along))
     log_ratio = coupling.log_ratio if along == "x" else -coupling.log_ratio
     prior = np.array([0, 0, 0, coupling.line_px, log_ratio, coupling.ratio, _BOUNCE_RATIO])
     out = np.full((ROWS, pixels.size), np.nan, np.float32)
@@ -244,26 +245,31 @@ def separate_jointly(
     def decide(these: NDArray[np.intp], fits_across: Floats, undecided_if: tuple[float, float, float]) -> None:
         if not these.size:
             return
-        z1, z2, s1, s2, first, place, rise = (_taken(v, these) for v in (za, zb, sigma_a, sigma_b, fits, other, slope))
-        found = np.full((ROWS, these.size), np.nan, np.float32)
         most = 2 * len(fits) + 2 * PAIRS * len(fits_across)
+        spare: SimpleQueue[Any] = SimpleQueue()
+        for _ in range(CORES):
+            near = workspace(profiles_a, profiles_b)
+            hypotheses = np.empty((_BLOCK, most, 8)), np.empty((_BLOCK, most, 3)), np.empty((_BLOCK, most))
+            for_seeds, for_fits = seed_workspace(len(za), len(zb), comb), fit_workspace(len(za), len(zb), most, near)
+            spare.put((for_seeds, *hypotheses, near, for_fits))
 
         def joint(start: int) -> None:
-            count = min(_BLOCK, these.size - start)
-            data = (
-                z1, z2, s1, s2, comb_a.gain, comb_b.gain, comb, -0.5, a.extent - 0.5, -0.5, b.extent - 0.5,
-            )  # fmt: skip
-            seeds, lines, bounds = np.empty((count, most, 8)), np.empty((count, most, 3)), np.empty((count, most))
-            work, near = seed_workspace(len(z1), len(z2), comb), workspace(profiles_a, profiles_b)
-            seed_block(*data, first, place, rise, fits_across, prior, start, work, seeds, lines, bounds)
-            joint_block(
-                *data, seeds, lines, bounds, prior, LARGER_IS_DIRECT, profiles_a.arrays, profiles_b.arrays,
-                near, fit_workspace(len(z1), len(z2), most, near), undecided_if, found, start,
-            )  # fmt: skip
+            for_seeds, seeds, lines, bounds, near, for_fits = arrays = spare.get()
+            try:
+                data = (
+                    za, zb, sigma_a, sigma_b, comb_a.gain, comb_b.gain, comb, -0.5, a.extent - 0.5, -0.5, b.extent - 0.5,
+                    these[start : start + _BLOCK],
+                )  # fmt: skip
+                seed_block(*data, fits, other, slope, fits_across, prior, start, for_seeds, seeds, lines, bounds)
+                joint_block(
+                    *data, seeds, lines, bounds, prior, LARGER_IS_DIRECT, profiles_a.arrays, profiles_b.arrays, near,
+                    for_fits, undecided_if, out,
+                )  # fmt: skip
+            finally:
+                spare.put(arrays)
 
         with ThreadPoolExecutor(CORES) as pool:
             list(pool.map(joint, range(0, these.size, _BLOCK)))
-        out[:, these] = found
 
     def ask_across(these: NDArray[np.intp]) -> None:
         fits_across = separate_candidates(b.z[:, these], b.frequency, b.sigma_z[these], b.extent, b.gain)
@@ -281,11 +287,6 @@ def separate_jointly(
     best, rival = (_pair(out[k * FIELDS : (k + 1) * FIELDS], order) for k in range(2))
     fits_together = best.chi2 < chi2_distribution.isf(1 / REFUSED_ONE_IN, dof)
     return DirectPaths(best, rival, confidence, third & ~fits_together, dof, order[0])
-
-
-def _taken(values: NDArray[Any], these: NDArray[np.intp]) -> Any:
-    """Some pixels of (…, P) values, contiguous as the kernel wants them."""
-    return np.ascontiguousarray(values[..., these])
 
 
 def _pair(rows: Floats, order: list[int]) -> PathPair:

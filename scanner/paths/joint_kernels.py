@@ -68,17 +68,16 @@ def fit_workspace(count_a: int, count_b: int, most: int, near: Workspace) -> Fit
 @compiled  # pragma: no cover
 def joint_block(
     za: NDArray[np.complex64], zb: NDArray[np.complex64], sigma_a: Reals, sigma_b: Reals, gain_a: Reals, gain_b: Reals,
-    comb: Reals, low_a: float, high_a: float, low_b: float, high_b: float, seeds: Reals, lines: Reals, bounds: Reals,
-    prior: Reals, larger_is_direct: float, profile_a: Profile, profile_b: Profile, near: Workspace,
-    work: FitWorkspace, undecided_if: tuple[float, float, float], out: Floats, start: int,
+    comb: Reals, low_a: float, high_a: float, low_b: float, high_b: float, numbers: NDArray[np.intp],
+    seeds: Reals, lines: Reals, bounds: Reals, prior: Reals, larger_is_direct: float, profile_a: Profile,
+    profile_b: Profile, near: Workspace, work: FitWorkspace, undecided_if: tuple[float, float, float], out: Floats,
 ) -> None:  # fmt: skip
-    """The likeliest direct path of the pixels from ``start`` on, and its rival, as rows of ``out``.
+    """The likeliest direct path of the pixels ``numbers`` (n,), and its rival, as rows of ``out``.
 
     ``seeds``, ``lines``, ``bounds`` as `scanner.paths.joint_seeds.seed_block` leaves them; the profiles are
-    `Profiles.arrays` of both axes, ``near`` is `workspace` of `scanner.paths.joint_nearby` and
-    ``work`` `fit_workspace`. A pixel stays without a
-    result where half the lead of its best hypothesis' score over a rival's, its χ² or its paths' distance along are
-    below, above, below ``undecided_if``.
+    `Profiles.arrays` of both axes, ``near`` is `workspace` of `scanner.paths.joint_nearby`, ``work`` is
+    `fit_workspace`. A pixel stays without a result where half the lead of its best hypothesis' score over a rival's is
+    below the first of ``undecided_if``, its χ² above the second, or the distance of its paths along below the third.
     """
     posterior_a, posterior_b = near[8], near[9]
     least_lead, most_chi2, least_apart = undecided_if
@@ -89,8 +88,9 @@ def joint_block(
         ya, yb, folded_a, folded_b, thetas, steps, variances, priors, systems, chi2s, gains, promised, scores, trial,
         spare, weights, of_place, found, mixture,
     ) = work  # fmt: skip
-    for n in range(bounds.shape[0]):
-        p = start + n
+    for n in range(numbers.size):
+        p = numbers[n]
+        out[:, p] = math.nan
         for t in range(count_a):
             ya[t] = (1 / gain_a[t]) * za[t, p]
         for t in range(count_b):

@@ -21,6 +21,7 @@ from scanner.paths.rotation import compiled, rotation
 Floats = NDArray[np.float32]
 Reals = NDArray[np.float64]
 Phasors = NDArray[np.complex128]
+Numbers = NDArray[np.intp]
 SeedWorkspace = tuple[
     Phasors, Phasors, Phasors, Reals, Reals, Reals, Reals, Reals, Reals, Phasors, Phasors
 ]  # fmt: skip
@@ -207,10 +208,11 @@ def _known(thetas: Reals, count: int) -> bool:
 @compiled  # pragma: no cover
 def seed_block(
     za: NDArray[np.complex64], zb: NDArray[np.complex64], sigma_a: Reals, sigma_b: Reals, gain_a: Reals, gain_b: Reals,
-    comb: Reals, low_a: float, high_a: float, low_b: float, high_b: float, fits: Floats, other: Reals, slopes: Reals,
-    fits_across: Floats, prior: Reals, start: int, work: SeedWorkspace, seeds: Reals, lines: Reals, bounds: Reals,
+    comb: Reals, low_a: float, high_a: float, low_b: float, high_b: float, numbers: Numbers, fits: Floats,
+    other: Reals, slopes: Reals, fits_across: Floats, prior: Reals, start: int, work: SeedWorkspace, seeds: Reals,
+    lines: Reals, bounds: Reals,
 ) -> None:  # fmt: skip
-    """Hypotheses of the pixels from ``start`` on, as many as ``bounds`` has rows.
+    """Hypotheses of the pixels ``numbers`` (n,), of which ``fits_across`` holds those from ``start`` on.
 
     ``seeds`` (n, most, 8) get u₁, u₂, a₁, a₂ along and across, path 1 direct; ``lines`` (n, most, 3) a place along, the
     place across that the line gives to it, and the line's slope; ``bounds`` (n, most) what χ² will hardly fall below,
@@ -219,8 +221,8 @@ def seed_block(
     count_a, count_b, kinds, kinds_across = za.shape[0], zb.shape[0], fits.shape[0], fits_across.shape[0]
     ya, yb, left, moduli, ga, gb, pairs, distances, folded, turns_a, turns_b = work
     kappa = math.exp(prior[4])
-    for n in range(bounds.shape[0]):
-        p = start + n
+    for n in range(numbers.size):
+        p, q = numbers[n], start + n
         for t in range(count_a):
             ya[t], ga[t] = (1 / gain_a[t]) * za[t, p], (gain_a[t] / sigma_a[p]) ** 2
         for t in range(count_b):
@@ -247,14 +249,14 @@ def seed_block(
             fold(ya, gain_a, sigma_a[p], comb[0], comb[1], folded)
         for k in range(kinds_across):
             for i in range(2):
-                b1, b2 = fits_across[k, 2 + i, p], fits_across[k, 3 - i, p]
-                allowed = _NEAR_LINE_PX + _NEAR_LINE_SIGMAS * (prior[3] + fits_across[k, 4 + i, p])
-                if not (fits_across[k, 7, p] < fits_across[0, 7, p] + _HOPELESS_CHI2 and b1 > 0):
+                b1, b2 = fits_across[k, 2 + i, q], fits_across[k, 3 - i, q]
+                allowed = _NEAR_LINE_PX + _NEAR_LINE_SIGMAS * (prior[3] + fits_across[k, 4 + i, q])
+                if not (fits_across[k, 7, q] < fits_across[0, 7, q] + _HOPELESS_CHI2 and b1 > 0):
                     continue
                 off = math.inf
                 for m in range(other.shape[0]):
                     if math.isfinite(other[m, p]):
-                        off = min(off, abs(fits_across[k, i, p] - other[m, p]) - _APART_PX * abs(slopes[m, p]))
+                        off = min(off, abs(fits_across[k, i, q] - other[m, p]) - _APART_PX * abs(slopes[m, p]))
                 if not off < allowed:
                     continue
                 _pairs(
@@ -272,13 +274,13 @@ def seed_block(
                         continue
                     there, s = fits[nearest // 2, nearest % 2, p], slopes[nearest, p]
                     place = other[nearest, p] + s * (pairs[j, 1] - there)
-                    if not abs(fits_across[k, i, p] - place) < allowed * math.sqrt(1 + s * s):
+                    if not abs(fits_across[k, i, q] - place) < allowed * math.sqrt(1 + s * s):
                         continue
                     theta = seeds[n, tried]
                     theta[0], theta[1], theta[2], theta[3] = pairs[j, 1], pairs[j, 2], b1 / kappa, pairs[j, 3]
-                    theta[4], theta[5], theta[6], theta[7] = fits_across[k, i, p], fits_across[k, 1 - i, p], b1, b2
+                    theta[4], theta[5], theta[6], theta[7] = fits_across[k, i, q], fits_across[k, 1 - i, q], b1, b2
                     if _known(seeds[n], tried):
                         continue
                     lines[n, tried, 0], lines[n, tried, 1], lines[n, tried, 2] = theta[0], place, s
-                    bounds[n, tried] = fits_across[k, 7, p]
+                    bounds[n, tried] = fits_across[k, 7, q]
                     tried += 1
