@@ -257,8 +257,8 @@ def separate_jointly(
             for_seeds, seeds, lines, bounds, near, for_fits = arrays = spare.get()
             try:
                 data = (
-                    za, zb, sigma_a, sigma_b, comb_a.gain, comb_b.gain, comb, -0.5, a.extent - 0.5, -0.5, b.extent - 0.5,
-                    these[start : start + _BLOCK],
+                    za, zb, sigma_a, sigma_b, comb_a.gain, comb_b.gain, comb, -0.5, a.extent - 0.5, -0.5,
+                    b.extent - 0.5, these[start : start + _BLOCK],
                 )  # fmt: skip
                 seed_block(*data, fits, other, slope, fits_across, prior, start, for_seeds, seeds, lines, bounds)
                 joint_block(
