@@ -67,20 +67,22 @@ def normal_equations(along: Reals, across: Reals, prior: Reals, theta: Reals, sy
     b[2, 0] = -weight * slope
     gq[0] += weight * slope * off
     gp[2] -= weight * off
-    weight, off = 1 / (prior[5] * prior[5]), math.log(b1 / a1) - prior[4]
+    per_a, per_b = 1 / a1, 1 / b1
+    weight, off = 1 / (prior[5] * prior[5]), math.log(b1 * per_a) - prior[4]
     chi2 += weight * off * off
-    q[1] += weight / (a1 * a1)
-    p[3] += weight / (b1 * b1)
-    b[3, 1] = -weight / (a1 * b1)
-    gq[1] += weight * off / a1
-    gp[3] -= weight * off / b1
-    weight, off = 1 / (prior[6] * prior[6]), math.log(b2 / a2) - prior[4]
+    q[1] += weight * per_a * per_a
+    p[3] += weight * per_b * per_b
+    b[3, 1] = -weight * per_a * per_b
+    gq[1] += weight * off * per_a
+    gp[3] -= weight * off * per_b
+    per_a, per_b = 1 / a2, 1 / b2
+    weight, off = 1 / (prior[6] * prior[6]), math.log(b2 * per_a) - prior[4]
     chi2 += weight * off * off
-    p[1] += weight / (a2 * a2)
-    q[3] += weight / (b2 * b2)
-    b[1, 3] = -weight / (a2 * b2)
-    gp[1] += weight * off / a2
-    gq[3] -= weight * off / b2
+    p[1] += weight * per_a * per_a
+    q[3] += weight * per_b * per_b
+    b[1, 3] = -weight * per_a * per_b
+    gp[1] += weight * off * per_a
+    gq[3] -= weight * off * per_b
     return float(chi2)
 
 
