@@ -21,6 +21,7 @@ from scanner.methods.separated import Separated
 from scanner.patterns import AXES
 from scanner.regions import (
     between_paths,
+    beyond_the_middle,
     continued,
     emitter_mask,
     inside,
@@ -225,7 +226,10 @@ def _masks(
             found = np.where(np.isnan(found), doubted[mine], found)
             place[mine] = found
             direct.append(np.append(u[chosen], found))
-        emitters = paths[2][chosen], paths[3][chosen]
+        ends = paths[0][chosen], paths[1][chosen], paths[2][chosen], paths[3][chosen]
+        # The margin grows neither onto emitters nor across a fold.
+        across = beyond_the_middle(*ends, CLOSE_PATHS_PX)
+        emitters = np.append(ends[2], across[0]), np.append(ends[3], across[1])
         mask = sound_mask(direct[0], direct[1], size, margin_px, emitters, step)
         around = rim & (nearest == k)
         along = sound_mask(first[0][around], first[1][around], size, margin_px, None, step)
