@@ -6,6 +6,8 @@ The scenes, poses and seeds of this file were not used to set anything.
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +19,9 @@ from scanner.config import GatesSection, ScanSection
 from scanner.decoding import Decoder
 from scanner.methods import METHODS
 from scanner.methods.base import Setup
+from scanner.methods.fold import Fold
+from scanner.methods.regional import begin
+from scanner.methods.separated import Separated
 from scanner.patterns import Plan
 from scanner.processing import process_take
 from scanner.result import Flag
@@ -226,3 +231,41 @@ def test_where_a_bounce_is_too_weak_to_be_detected_it_is_gone_as_well(scan_simul
     assert spread <= 1.15 * twin
     alone = np.abs(maps.x_p_round1 - truth.x_p)[window]
     assert np.nanmedian(alone) > 2 * np.nanmedian(np.abs(maps.x_p - truth.x_p)[window])
+
+
+def test_far_from_a_clear_separation_coordinates_that_agree_say_where_to_light():
+    # A square where a third path spoils the fit of two: its direct coordinates hold, its bounces do not.
+    rows, columns = np.mgrid[:200, :200].astype(np.float32)
+    x, y = 100 + columns, 50 + rows
+    spoilt = (np.abs(rows - 100) < 80) & (np.abs(columns - 100) < 80)
+    count = x.size
+    yes, clear = np.ones(count, bool), ~spoilt.ravel()
+    random = np.random.default_rng(3)
+    bounce = np.where(spoilt, random.uniform(300, 600, x.shape), x + 350).astype(np.float32)
+    separated = Separated(
+        shape=x.shape,
+        pixels=np.arange(count),
+        u={"x": x.ravel(), "y": y.ravel()},
+        sigma={"x": np.full(count, 0.01, np.float32), "y": np.full(count, 0.01, np.float32)},
+        bounce={"x": bounce.ravel(), "y": y.ravel()},
+        plausible=clear,
+        trusted=clear,
+        third=~clear,
+        off_line=~yes,
+        located=clear,
+        strength=np.full(count, 0.5, np.float32),
+        blur=np.ones(count, np.float32),
+    )
+    no = np.zeros(x.shape, bool)
+    dark = np.zeros((300, 700), bool)
+    detection = SimpleNamespace(region=~no, penumbra=no, depth_edge=no)
+    first = SimpleNamespace(x_p_round1=x, y_p_round1=y, valid=no)
+    begun = begin(separated, detection, Fold(no, dark, dark), first, (700, 300), 8.0, 4)
+    assert len(begun.queue) == 1
+    assert begun.queue[0][50:250, 100:300].all()
+    # Coordinates that agree with no neighbour light nothing.
+    scattered = np.where(spoilt, random.uniform(300, 600, x.shape), x).astype(np.float32)
+    astray = replace(separated, u={"x": scattered.ravel(), "y": y.ravel()})
+    begun = begin(astray, detection, Fold(no, dark, dark), first, (700, 300), 8.0, 4)
+    assert not begun.queue[0][:, 310:].any()
+    assert not begun.queue[0][130:170, 180:220].any()
