@@ -43,9 +43,9 @@ from scanner.methods.regional import (
     Regional,
     again,
     begin,
+    concluded,
     lit_here,
     plane,
-    remaining,
 )
 from scanner.methods.separated import Separated, phasors_of, separate_region
 from scanner.methods.sufficiency import Evidence, weigh
@@ -327,7 +327,7 @@ class MicroFrequencyShifting:
             notes=[],
         )
         more = setup.scan.regional_rule == "sound" and len(decoded) == 2 and state.most < MOST_SEQUENCES
-        return _concluded(joined, first.decision, region, state, more)
+        return concluded(joined, first.decision, region, state, more)
 
     def skip(self, first: FirstRound) -> FirstRound:
         """Go on without the sequence that `second_round` has planned."""
@@ -368,23 +368,6 @@ def _near(maps: Maps, x: NDArray[np.float32] | None, y: NDArray[np.float32] | No
         if u is not None and v is not None:
             near &= np.abs(u - v) <= _SAME_PLACE_PX
     return near
-
-
-def _concluded(first: FirstRound, said: str, region: NDArray[np.bool_], state: Regional, more: bool) -> FirstRound:
-    """Say after the last sequence how many there were, what they have left, and whether ``more`` could be allowed."""
-    if state.queue:
-        return first
-    rest = int(remaining(state, region).sum())
-    share = rest / max(int(region.sum()), 1)
-    told = f"{state.taken} regional sequences: places of the bounce region light each other" if state.taken > 1 else ""
-    notes = []
-    if share > WORTH:
-        notes.append(
-            f"{100 * share:.1f} % of the bounce region's pixels still see a bounce after {state.taken} regional "
-            f"sequence{'s' * (state.taken > 1)}, or could not be lit: they hold what round one separates, or nothing"
-            + ("; scan.max_regional_sequences allows more" if more and state.taken >= state.most else "")
-        )
-    return replace(first, decision="; ".join(t for t in (said, told) if t), notes=notes)
 
 
 def _detect_pooled(

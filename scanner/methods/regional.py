@@ -9,27 +9,22 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from scanner.groups import group_places
 from scanner.interreflection import Detection
+from scanner.methods.base import FirstRound
 from scanner.methods.fold import CLOSE_PATHS_PX, Fold
+from scanner.methods.lit_sets import lit_sets
 from scanner.methods.separated import Separated
 from scanner.patterns import AXES
 from scanner.regions import (
     between_paths,
-    beyond_the_middle,
-    continued,
-    emitter_mask,
     inside,
     lit_together,
     on_surface,
     pitch,
-    sound_mask,
-    surfaces,
 )
 from scanner.result import Maps
 
@@ -47,12 +42,6 @@ WORTH = 0.01
 
 _PROGRESS = 0.7
 """Sequences for what is left follow only while they leave less than this share of what there was."""
-
-_AROUND_PX = 24.0
-"""Standard deviation of the window in which what round one does not tell follows most of what it does, camera px."""
-
-_EMITTER_PX = 3.0
-"""How far from an emitter undetected places are lit along."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +169,7 @@ def begin(
     if group.max() < 1 and both:
         group = np.where(plausible(separated) & lit_together(*paths), np.int8(0), np.int8(-1))
     between = detection.region & (group < 0)
-    x, y, group, masks = _masks(group, paths, located, between, rim, (one_x, one_y), separated, size, margin_px)
+    x, y, group, masks = lit_sets(group, paths, located, between, rim, (one_x, one_y), separated, size, margin_px)
     masks = [mask & ~fold.strip for mask in masks]
     return replace(
         Regional.nothing(shape, size),
@@ -193,74 +182,6 @@ def begin(
         most=most,
         left=int(detection.region.sum()),
     )
-
-
-def _masks(
-    group: NDArray[np.int8],
-    paths: NDArray[np.float32],
-    located: NDArray[np.bool_],
-    between: NDArray[np.bool_],
-    rim: NDArray[np.bool_],
-    first: tuple[NDArray[np.float32], NDArray[np.float32]],
-    separated: Separated,
-    size: tuple[int, int],
-    margin_px: float,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int8], list[NDArray[np.bool_]]]:
-    """Direct places of all that is served, the group that serves each, and what every group lights."""
-    places = [np.where(group >= 0, p, np.float32(np.nan)) for p in paths[:2]]
-    for place, u in zip(places, first, strict=True):
-        place[rim] = u[rim]
-    if group.max(initial=-1) < 0:
-        return places[0], places[1], group, []
-    nearest = _around(group, [np.where(np.isfinite(p), p, u) for p, u in zip(places, first, strict=True)])
-    step = pitch(paths[0], paths[1])
-    masks = []
-    doubtful = _direct_anyhow(separated)
-    for k in range(int(group.max()) + 1):
-        chosen, mine = group == k, between & (nearest == k)
-        direct = []
-        for place, u, doubted, a in zip(places, paths[:2], doubtful, AXES, strict=True):
-            # Where the fringe orders of both paths could not be told, the surface around them can.
-            found = continued(u, chosen, mine) if a in separated.u else u[mine]
-            # Farther from it, many pixels that agree: a third path spoils a bounce sooner than the direct path.
-            found = np.where(np.isnan(found), doubted[mine], found)
-            place[mine] = found
-            direct.append(np.append(u[chosen], found))
-        ends = paths[0][chosen], paths[1][chosen], paths[2][chosen], paths[3][chosen]
-        # The margin grows neither onto emitters nor across a fold.
-        across = beyond_the_middle(*ends, CLOSE_PATHS_PX)
-        emitters = np.append(ends[2], across[0]), np.append(ends[3], across[1])
-        mask = sound_mask(direct[0], direct[1], size, margin_px, emitters, step)
-        around = rim & (nearest == k)
-        along = sound_mask(first[0][around], first[1][around], size, margin_px, None, step)
-        sources = paths[2][chosen & located], paths[3][chosen & located]
-        masks.append(mask | (along & ~emitter_mask(*sources, size, _EMITTER_PX, step)))
-    return places[0], places[1], np.where(np.isfinite(places[0]) | np.isfinite(places[1]), nearest, -1), masks
-
-
-def _direct_anyhow(separated: Separated) -> NDArray[np.float32]:
-    """(2, H, W) direct coordinates of all separated pixels, fitting or not, where they continue each other, px."""
-    found = np.full((2, *separated.shape), np.nan, np.float32)
-    if len(separated.u) == 2:
-        found.reshape(2, -1)[:, separated.pixels] = [separated.u[a] for a in AXES]
-        found[:, ~on_surface(found[0], found[1])] = np.nan
-    return found
-
-
-def _around(group: NDArray[np.int8], places: list[NDArray[np.float32]]) -> NDArray[np.int8]:
-    """(H, W) group of every pixel: its own, else that of most pixels around it, on the same surface if there is any."""
-    count, labels, _ = surfaces(places[0], places[1])
-    votes = []
-    for k in range(int(group.max()) + 1):
-        mine = group == k
-        there = np.zeros(count, bool)
-        there[labels[mine]] = True
-        there[0] = False
-        near = cv2.GaussianBlur(mine.astype(np.float32), (0, 0), _AROUND_PX, borderType=cv2.BORDER_CONSTANT)
-        # Beyond the blur the nearest counts, a little.
-        votes.append(near + 1e-6 / (1 + distance_transform_edt(~mine)) + there[labels])
-    found = np.argmax(np.stack(votes), axis=0)
-    return np.where(group >= 0, group, found).astype(np.int8)
 
 
 def again(
@@ -295,7 +216,7 @@ def again(
         group = np.where(known & lit_together(*paths), np.int8(0), np.int8(-1))
     nothing = np.zeros_like(rest)
     between, located = rest & (group < 0), np.isfinite(paths[2])
-    x, y, group, masks = _masks(
+    x, y, group, masks = lit_sets(
         group, paths, located, between, nothing, (paths[0], paths[1]), separated, size, margin_px
     )
     masks = [mask & ~regional.strip for mask in masks]
@@ -340,3 +261,20 @@ def lit_here(lit: NDArray[np.bool_], x: NDArray[np.float32] | None, y: NDArray[n
     assert y is not None
     rows = np.asarray(lit.any(axis=1))
     return inside(np.repeat(rows[:, None], lit.shape[1], axis=1), np.zeros_like(y), y, CLEARANCE_PX)
+
+
+def concluded(first: FirstRound, said: str, region: NDArray[np.bool_], state: Regional, more: bool) -> FirstRound:
+    """Say after the last sequence how many there were, what they have left, and whether ``more`` could be allowed."""
+    if state.queue:
+        return first
+    rest = int(remaining(state, region).sum())
+    share = rest / max(int(region.sum()), 1)
+    told = f"{state.taken} regional sequences: places of the bounce region light each other" if state.taken > 1 else ""
+    notes = []
+    if share > WORTH:
+        notes.append(
+            f"{100 * share:.1f} % of the bounce region's pixels still see a bounce after {state.taken} regional "
+            f"sequence{'s' * (state.taken > 1)}, or could not be lit: they hold what round one separates, or nothing"
+            + ("; scan.max_regional_sequences allows more" if more and state.taken >= state.most else "")
+        )
+    return replace(first, decision="; ".join(t for t in (said, told) if t), notes=notes)
