@@ -24,19 +24,30 @@ def pytest_addoption(parser):
 
 
 HERE = Path(__file__).parent
-ALONE = (
+TIMED = (
     "conformance", "drivers/test_doctor", "drivers/test_genicam_faults", "drivers/test_genicam_traps",
     "drivers/test_process", "drivers/test_trigger_box", "drivers/test_window", "scanner/test_cli_interrupted",
     "scanner/test_preview", "sim_backend/gentl", "sim_backend/test_trigger_box", "sim_backend/test_world",
     "sim_backend/test_xserver", "test_virtual",
 )  # fmt: skip
-"""Where tests live on real time, windows or processes of their own: they have the machine to themselves."""
+"""Where tests live on real time, windows or processes of their own: they have the machine to themselves, two by two."""
+
+LONGEST = (
+    "test_numbers", "calibration/test_wizard", "calibration/test_person", "test_calibration_numbers",
+    "scanner/test_ripples", "scanner/test_acquisition", "scanner/test_cli", "real/test_slstudio_calibration",
+    "sim_backend/test_scenes", "calibration/test_detection", "scanner/test_regional",
+    "test_virtual_faults", "test_virtual_bench", "drivers/test_window_faults", "test_virtual_latency",
+)  # fmt: skip
+"""What takes longest begins first, so that no worker is left with it when the others have nothing to do any more."""
 
 
 def pytest_collection_modifyitems(items):
-    for item in items:
-        if item.path.is_relative_to(HERE) and item.path.relative_to(HERE).as_posix().startswith(ALONE):
-            item.add_marker(pytest.mark.alone)
+    places = {item: item.path.relative_to(HERE).as_posix() for item in items if item.path.is_relative_to(HERE)}
+    for item, place in places.items():
+        if place.startswith(TIMED):
+            item.add_marker(pytest.mark.timed)
+    turns = {f"{name}.py": turn for turn, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: turns.get(places.get(item, ""), len(turns)))
 
 
 def pytest_configure(config):
