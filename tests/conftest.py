@@ -33,10 +33,10 @@ TIMED = (
 """Where tests live on real time, windows or processes of their own: they have the machine to themselves, two by two."""
 
 LONGEST = (
-    "test_numbers", "calibration/test_wizard", "calibration/test_person", "test_calibration_numbers",
-    "scanner/test_ripples", "scanner/test_acquisition", "scanner/test_cli", "real/test_slstudio_calibration",
-    "sim_backend/test_scenes", "calibration/test_detection", "scanner/test_regional",
-    "test_virtual_faults", "test_virtual_bench", "drivers/test_window_faults", "test_virtual_latency",
+    "test_numbers", "test_calibration_numbers", "calibration/test_wizard", "scanner/test_ripples",
+    "scanner/test_acquisition", "real/test_slstudio_calibration", "calibration/test_detection",
+    "sim_backend/test_scenes", "scanner/test_cli", "scanner/test_regional", "calibration/test_person",
+    "test_virtual_faults", "test_virtual_bench", "scanner/test_cli_interrupted", "drivers/test_window_faults",
 )  # fmt: skip
 """What takes longest begins first, so that no worker is left with it when the others have nothing to do any more."""
 
