@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scanner.response import checked_light, nearest_levels
 
 Axis = Literal["x", "y"]
+AXES: tuple[Axis, Axis] = ("x", "y")
 
 
 @dataclass(frozen=True)

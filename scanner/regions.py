@@ -110,6 +110,7 @@ def between_paths(
     bounce_y: NDArray[np.float32],
     size: tuple[int, int],
     reach_px: float,
+    share: float = 1.0,
 ) -> NDArray[np.bool_]:
     """Projector pixels between a direct place and the emitter of its bounce, where these are near to each other.
 
@@ -123,16 +124,44 @@ def between_paths(
         Projector (width, height), px.
     reach_px
         Paths farther apart than this tell nothing.
+    share
+        How much of the way counts, from the direct place on; to the fold it is a half.
 
     Returns
     -------
     NDArray
         (height, width) bool.
     """
+    return _close(_believed(_splat(*_along(x, y, bounce_x, bounce_y, reach_px, (0, share)), size), 1), 1)
+
+
+def beyond_the_middle(
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    bounce_x: NDArray[np.float32],
+    bounce_y: NDArray[np.float32],
+    reach_px: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Places (x, y) on the other side of a fold: nearer to the emitter of a bounce than to its own place.
+
+    Parameters as `between_paths`, whose second half this is.
+    """
+    return _along(x, y, bounce_x, bounce_y, reach_px, (0.5, 1))
+
+
+def _along(
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    bounce_x: NDArray[np.float32],
+    bounce_y: NDArray[np.float32],
+    reach_px: float,
+    part: tuple[float, float],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Points a pixel apart on a part of the way from direct places to emitters, where these are near to each other."""
     near = np.hypot(bounce_x - x, bounce_y - y) <= reach_px
-    way = np.linspace(0, 1, int(np.ceil(reach_px)) + 1, dtype=np.float32)[:, None]
-    along = [(u[near] + way * (v[near] - u[near])).ravel() for u, v in ((x, bounce_x), (y, bounce_y))]
-    return _close(_believed(_splat(along[0], along[1], size), 1), 1)
+    way = np.linspace(*part, int(np.ceil((part[1] - part[0]) * reach_px)) + 1, dtype=np.float32)[:, None]
+    first, second = ((u[near] + way * (v[near] - u[near])).ravel() for u, v in ((x, bounce_x), (y, bounce_y)))
+    return first, second
 
 
 def pitch(x: NDArray[np.float32], y: NDArray[np.float32]) -> float:

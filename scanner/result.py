@@ -43,6 +43,8 @@ class Flag(IntFlag):
     """A weak bounce that only the neighbourhood shows was taken off the coordinate."""
     STRAY = 8192
     """The coordinate was refused: hardly any neighbour goes on with it."""
+    BLIND = 16384
+    """The coordinate was refused: between a fold and bounces from across it, too near for fringes to show them."""
 
 
 @dataclass(frozen=True)

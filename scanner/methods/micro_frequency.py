@@ -35,9 +35,9 @@ from scanner.methods.base import (
     refuse_off_epipolar,
     stepped_plan,
 )
+from scanner.methods.fold import Fold, doubted_beside, find_folds
 from scanner.methods.multi_frequency import DecodedAxis, decode_axes, one_path_maps
 from scanner.methods.regional import (
-    AXES,
     MOST_SEQUENCES,
     WORTH,
     Regional,
@@ -50,7 +50,7 @@ from scanner.methods.regional import (
 from scanner.methods.separated import Separated, phasors_of, separate_region
 from scanner.methods.sufficiency import Evidence, weigh
 from scanner.methods.weak_bounces import without_ripples
-from scanner.patterns import Axis, Plan
+from scanner.patterns import AXES, Axis, Plan
 from scanner.phasors import RoundPhasors
 from scanner.pooling import one_path_residuals
 from scanner.regions import literal_mask
@@ -123,13 +123,16 @@ class MicroFrequencyShifting:
         refused = detection.region | detection.depth_edge | detection.suspicious
         clean = usable & maps.valid & ~refused
         seen = usable & ~detection.region & ~detection.depth_edge
-        decoded, rippled = without_ripples(frames, decoded, seen, clean, setup)
+        decoded, rippled, told = without_ripples(frames, decoded, seen, clean, setup)
         separated = separate_region(frames, decoded, detection, clean, setup)
+        fold = find_folds(separated, detection, maps.x_p, maps.y_p, frames.plan.size)
+        separated = doubted_beside(fold, separated)
         flags = first_flags(usable, frames.saturated, [u for u in (maps.x_p, maps.y_p) if u is not None])
         flags[detection.region] |= np.uint16(Flag.INTERREFLECTION)
         flags[detection.depth_edge] |= np.uint16(Flag.DEPTH_EDGE)
         flags[detection.suspicious] |= np.uint16(Flag.MISFIT)
-        flags[rippled] |= np.uint16(Flag.RIPPLE)
+        flags[told] |= np.uint16(Flag.RIPPLE)
+        flags[fold.blind] |= np.uint16(Flag.BLIND)
         planes: tuple[tuple[Axis, NDArray[np.float32] | None, NDArray[np.float32] | None], ...] = (
             ("x", maps.x_p, maps.sigma_x),
             ("y", maps.y_p, maps.sigma_y),
@@ -141,7 +144,7 @@ class MicroFrequencyShifting:
         }
         results: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
         for axis, (u, sigma) in known.items():
-            u[refused] = sigma[refused] = np.nan
+            u[refused | fold.blind] = sigma[refused | fold.blind] = np.nan
             _put(u, separated, separated.u[axis])
             _put(sigma, separated, separated.sigma[axis])
             results[axis] = (u, sigma)
@@ -166,7 +169,7 @@ class MicroFrequencyShifting:
             score=detection.statistic,
         )
         evidence = weigh(separated, frames.plan.size)
-        regional = self._begun(first, separated, detection, evidence, frames.plan, setup.scan)
+        regional = self._begun(first, separated, detection, fold, evidence, frames.plan, setup.scan)
         return FirstRound(
             _finished(first, setup),
             frames.plan,
@@ -183,14 +186,21 @@ class MicroFrequencyShifting:
         return replace(first.plan, mask=first.private.regional.queue[0])
 
     def _begun(
-        self, maps: Maps, separated: Separated, detection: Detection, evidence: Evidence, plan: Plan, scan: ScanSection
+        self,
+        maps: Maps,
+        separated: Separated,
+        detection: Detection,
+        fold: Fold,
+        evidence: Evidence,
+        plan: Plan,
+        scan: ScanSection,
     ) -> Regional:
         """What the regional sequences are to light."""
         region = detection.region
         if self.rounds == 1 or scan.rounds == 1 or not region.any():
             return Regional.nothing(region.shape, plan.size)
         most = scan.max_regional_sequences if scan.regional_rule == "sound" else 1
-        begun = begin(separated, detection, maps, plan.size, scan.lit_margin_px, most)
+        begun = begin(separated, detection, fold, maps, plan.size, scan.lit_margin_px, most)
         if evidence.one_round(scan.rounds):
             return replace(begun, queue=())
         if scan.regional_rule == "literal":
@@ -230,7 +240,7 @@ class MicroFrequencyShifting:
             return replace(first, maps=replace(first.maps, lit=state.lit > 0), private=replace(private, regional=state))
         found, usable = one_path_maps(regional, decoded, setup)
         whole = usable & lit_here(lit, found.x_p, found.y_p)
-        decoded, rippled = without_ripples(regional, decoded, whole, whole, setup)
+        decoded, rippled, told = without_ripples(regional, decoded, whole, whole, setup)
         if rippled.any():
             found, _ = one_path_maps(regional, decoded, setup)
         total, dof = misfit_statistic([d.coordinates for d in decoded.values()])
@@ -239,7 +249,8 @@ class MicroFrequencyShifting:
             found = refuse_off_epipolar(found, setup.rig)
         region = private.detection.region
         own = state.own == state.taken
-        target = (_dilated(region, _HALO_PX) & ~private.detection.depth_edge) | (state.served & own)
+        blind = (first.maps.flags & np.uint16(Flag.BLIND)) > 0
+        target = ((_dilated(region, _HALO_PX) & ~private.detection.depth_edge) | (state.served & own)) & ~blind
         here = lit_here(lit, found.x_p, found.y_p)
         # Where bounces cover the picture, round one overrates the noise; a sequence without them does not.
         counted = target & usable & here
@@ -277,7 +288,7 @@ class MicroFrequencyShifting:
             | Flag.RIPPLE
             | Flag.STRAY
         )
-        flags[passed & rippled] |= np.uint16(Flag.RIPPLE)
+        flags[passed & told] |= np.uint16(Flag.RIPPLE)
         # With fewer bounces than round one, the sequence still sees one: round one's coordinate cannot stand either.
         there = lit_here(lit, first.maps.x_p, first.maps.y_p)
         refuted = target & ~region & usable & there & ~fits & (state.sequence == 0)

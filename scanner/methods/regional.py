@@ -16,10 +16,12 @@ from scipy.ndimage import distance_transform_edt
 
 from scanner.groups import group_places
 from scanner.interreflection import Detection
+from scanner.methods.fold import CLOSE_PATHS_PX, Fold
 from scanner.methods.separated import Separated
-from scanner.patterns import Axis
+from scanner.patterns import AXES
 from scanner.regions import (
     between_paths,
+    beyond_the_middle,
     continued,
     emitter_mask,
     inside,
@@ -36,9 +38,6 @@ CLEARANCE_PX = 2
 
 _CLEARANCE_PITCHES = 2.0
 """And those within so many camera pixels of it by the camera's."""
-
-CLOSE_PATHS_PX = 32.0
-"""Two fringes: between paths nearer than this others may meet unseen."""
 
 MOST_SEQUENCES = 8
 """One bit of `Maps.lit_by` each."""
@@ -70,6 +69,8 @@ class Regional:
         (H, W) uint8, the sequence that is meant to measure the pixel, 0 for none.
     served
         (H, W) bool, undetected pixels whose coordinates the sequences may replace.
+    strip
+        (height, width) bool, what stays dark: places that nothing can measure and that still throw bounces.
     most
         Sequences at most.
     taken
@@ -93,6 +94,7 @@ class Regional:
     y: NDArray[np.float32]
     own: NDArray[np.uint8]
     served: NDArray[np.bool_]
+    strip: NDArray[np.bool_]
     most: int
     taken: int
     lit: NDArray[np.uint8]
@@ -113,6 +115,7 @@ class Regional:
             y=unknown,
             own=np.zeros(shape, np.uint8),
             served=no,
+            strip=np.zeros((size[1], size[0]), bool),
             most=0,
             taken=0,
             lit=np.zeros((size[1], size[0]), np.uint8),
@@ -133,6 +136,7 @@ class Regional:
 def begin(
     separated: Separated,
     detection: Detection,
+    fold: Fold,
     first: Maps,
     size: tuple[int, int],
     margin_px: float,
@@ -144,6 +148,8 @@ def begin(
     ----------
     separated, detection, first
         Round one: both paths in its region, and the coordinates outside.
+    fold
+        What lies at folds: its strip stays dark.
     size
         Projector (width, height), px.
     margin_px
@@ -157,12 +163,13 @@ def begin(
     located = plane(separated, separated.located.astype(np.float32)) == 1
     nothing = np.full(shape, np.nan, np.float32)
     one_x, one_y = (nothing if u is None else u for u in (first.x_p_round1, first.y_p_round1))
-    rim = detection.penumbra & first.valid
+    rim = detection.penumbra
     both = len(separated.u) == 2
     if both:
         x, y, from_x, from_y = (p[known] for p in paths)
-        blind = between_paths(x, y, from_x, from_y, size, CLOSE_PATHS_PX)
-        rim |= first.valid & ~detection.region & ~detection.depth_edge & inside(blind, one_x, one_y, 0)
+        close = between_paths(x, y, from_x, from_y, size, CLOSE_PATHS_PX)
+        rim = rim | (~detection.region & ~detection.depth_edge & inside(close, one_x, one_y, 0))
+    rim = rim & first.valid & ~fold.blind
     group = np.where(known, np.int8(0), np.int8(-1))
     if both and most > 1:
         group[known] = -1
@@ -174,9 +181,11 @@ def begin(
         group = np.where(plausible(separated) & lit_together(*paths), np.int8(0), np.int8(-1))
     between = detection.region & (group < 0)
     x, y, group, masks = _masks(group, paths, located, between, rim, (one_x, one_y), separated, size, margin_px)
+    masks = [mask & ~fold.strip for mask in masks]
     return replace(
         Regional.nothing(shape, size),
         queue=tuple(masks) if masks and masks[0].any() else (),
+        strip=fold.strip,
         x=x,
         y=y,
         own=(group + 1).astype(np.uint8),
@@ -184,9 +193,6 @@ def begin(
         most=most,
         left=int(detection.region.sum()),
     )
-
-
-AXES: tuple[Axis, Axis] = ("x", "y")
 
 
 def _masks(
@@ -209,21 +215,36 @@ def _masks(
     nearest = _around(group, [np.where(np.isfinite(p), p, u) for p, u in zip(places, first, strict=True)])
     step = pitch(paths[0], paths[1])
     masks = []
+    doubtful = _direct_anyhow(separated)
     for k in range(int(group.max()) + 1):
         chosen, mine = group == k, between & (nearest == k)
         direct = []
-        for place, u, a in zip(places, paths[:2], AXES, strict=True):
+        for place, u, doubted, a in zip(places, paths[:2], doubtful, AXES, strict=True):
             # Where the fringe orders of both paths could not be told, the surface around them can.
             found = continued(u, chosen, mine) if a in separated.u else u[mine]
+            # Farther from it, many pixels that agree: a third path spoils a bounce sooner than the direct path.
+            found = np.where(np.isnan(found), doubted[mine], found)
             place[mine] = found
             direct.append(np.append(u[chosen], found))
-        emitters = paths[2][chosen], paths[3][chosen]
+        ends = paths[0][chosen], paths[1][chosen], paths[2][chosen], paths[3][chosen]
+        # The margin grows neither onto emitters nor across a fold.
+        across = beyond_the_middle(*ends, CLOSE_PATHS_PX)
+        emitters = np.append(ends[2], across[0]), np.append(ends[3], across[1])
         mask = sound_mask(direct[0], direct[1], size, margin_px, emitters, step)
         around = rim & (nearest == k)
         along = sound_mask(first[0][around], first[1][around], size, margin_px, None, step)
         sources = paths[2][chosen & located], paths[3][chosen & located]
         masks.append(mask | (along & ~emitter_mask(*sources, size, _EMITTER_PX, step)))
     return places[0], places[1], np.where(np.isfinite(places[0]) | np.isfinite(places[1]), nearest, -1), masks
+
+
+def _direct_anyhow(separated: Separated) -> NDArray[np.float32]:
+    """(2, H, W) direct coordinates of all separated pixels, fitting or not, where they continue each other, px."""
+    found = np.full((2, *separated.shape), np.nan, np.float32)
+    if len(separated.u) == 2:
+        found.reshape(2, -1)[:, separated.pixels] = [separated.u[a] for a in AXES]
+        found[:, ~on_surface(found[0], found[1])] = np.nan
+    return found
 
 
 def _around(group: NDArray[np.int8], places: list[NDArray[np.float32]]) -> NDArray[np.int8]:
@@ -277,6 +298,7 @@ def again(
     x, y, group, masks = _masks(
         group, paths, located, between, nothing, (paths[0], paths[1]), separated, size, margin_px
     )
+    masks = [mask & ~regional.strip for mask in masks]
     new = np.isfinite(x)
     return replace(
         regional,

@@ -65,6 +65,8 @@ class Separated:
         Whether two paths fit and neither lies on the epipolar line: a mirror shows the pixel something else.
     located
         Whether the fringe orders and the choice are clear, corroborated or not.
+    strength
+        α, the modulation of the bounce in units of the direct light's; of the weaker axis where there are two.
     blur
         Predicted σ in units of what the same amplitude reaches alone, on the axis that carries the depth.
     """
@@ -79,6 +81,7 @@ class Separated:
     third: NDArray[np.bool_]
     off_line: NDArray[np.bool_]
     located: NDArray[np.bool_]
+    strength: NDArray[np.float32]
     blur: NDArray[np.float32]
 
 
@@ -106,7 +109,7 @@ def separate_region(
         nan = np.full(pixels.size, np.nan, np.float32)
         no = np.zeros(pixels.size, bool)
         unknown = dict.fromkeys(axes, nan)
-        return Separated(detection.region.shape, pixels, unknown, unknown, unknown, no, no, no, no, no, nan)
+        return Separated(detection.region.shape, pixels, unknown, unknown, unknown, no, no, no, no, no, nan, nan)
     said = {a: _said(frames, a, decoded[a], pixels, detection.excess_noise) for a in axes}
     if setup.rig is not None and len(axes) == 2:
         coupling = _coupling(setup.rig, decoded, clean)
@@ -156,6 +159,7 @@ def _together(
         ~plausible & ~found.third,
         # Who lights whom is said by many pixels together: there a doubted separation still counts.
         clear,
+        np.asarray((best.amplitude[1] / best.amplitude[0]).min(axis=0), np.float32),
         np.asarray(blur[found.along], np.float32),
     )
 
@@ -168,6 +172,7 @@ def _apart(detection: Detection, pixels: NDArray[np.intp], said: dict[Axis, Axis
     plausible = choice.confidence > 0
     clear = choice.confidence > _CLEAR_CHOICE
     third = np.zeros(pixels.size, bool)
+    strength = np.full(pixels.size, np.inf, np.float32)
     blur = np.zeros(pixels.size, np.float32)
     u, spread, bounce = {}, {}, {}
     for axis, two in found.items():
@@ -178,9 +183,23 @@ def _apart(detection: Detection, pixels: NDArray[np.intp], said: dict[Axis, Axis
         third |= two.converged & ~fits
         plausible &= two.converged & fits
         clear &= two.margin > _CLEAR_ORDERS
+        strength = np.fmin(strength, two.amplitude[1 - pick, column] / two.amplitude[pick, column])
         blur = np.fmax(blur, spread[axis] / _alone(said[axis], two.amplitude[pick, column]))
     no, trusted = np.zeros(pixels.size, bool), plausible & clear
-    return Separated(detection.region.shape, pixels, u, spread, bounce, plausible, trusted, third, no, trusted, blur)
+    return Separated(
+        detection.region.shape,
+        pixels,
+        u,
+        spread,
+        bounce,
+        plausible,
+        trusted,
+        third,
+        no,
+        trusted,
+        strength,
+        blur,
+    )
 
 
 def _coupling(rig: Rig, decoded: dict[Axis, DecodedAxis], clean: NDArray[np.bool_]) -> Coupling:

@@ -14,6 +14,9 @@ from scanner.patterns import Axis
 from scanner.phasors import RoundPhasors
 from scanner.ripples import remove_ripples, shift_of
 
+_MATTERS = 0.5
+"""A shift of so many σ is worth telling."""
+
 
 def without_ripples(
     frames: RoundPhasors,
@@ -21,7 +24,7 @@ def without_ripples(
     good: NDArray[np.bool_],
     asked: NDArray[np.bool_],
     setup: Setup,
-) -> tuple[dict[Axis, DecodedAxis], NDArray[np.bool_]]:
+) -> tuple[dict[Axis, DecodedAxis], NDArray[np.bool_], NDArray[np.bool_]]:
     """Take the bounces that only neighbours show off the ``asked`` pixels, and off their phasors.
 
     Parameters
@@ -38,18 +41,22 @@ def without_ripples(
     Returns
     -------
     tuple
-        The axes without them, and (H, W) bool, the pixels that were changed.
+        The axes without them; (H, W) bool, the pixels that were changed; and those of them where that matters beside
+        the noise of the coordinate.
     """
     if not setup.scan.remove_ripples:
-        return decoded, np.zeros(good.shape, bool)
+        return decoded, np.zeros(good.shape, bool), np.zeros(good.shape, bool)
     smooth: dict[Axis, DecodedAxis] = {}
     ripples: dict[Axis, NDArray[np.float32]] = {}
+    matters = np.zeros(good.shape, bool)
     for axis, d in decoded.items():
         extent = frames.plan.extent(axis)
         coordinates, ripples[axis] = remove_ripples(
             phasors_of(frames, axis), d.coordinates, d.sigma_z, d.gain, good, asked, extent
         )
         smooth[axis] = replace(d, coordinates=coordinates)
+        shift = shift_of(ripples[axis], phasors_of(frames, axis).frequency)
+        matters |= shift >= _MATTERS * d.coordinates.sigma
     if len(ripples) == 2:
         pairs: tuple[tuple[Axis, Axis], ...] = (("x", "y"), ("y", "x"))
         for axis, other in pairs:
@@ -58,4 +65,5 @@ def without_ripples(
             c = smooth[axis].coordinates
             sigma = np.hypot(c.sigma, shift_of(hidden, phasors_of(frames, axis).frequency))
             smooth[axis] = replace(smooth[axis], coordinates=replace(c, sigma=sigma))
-    return smooth, np.asarray(np.maximum.reduce(list(ripples.values())) > 0)
+    changed = np.asarray(np.maximum.reduce(list(ripples.values())) > 0)
+    return smooth, changed, changed & matters

@@ -19,6 +19,7 @@ import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -26,9 +27,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 
 from scanner.paths.comb import prepare
-from scanner.paths.joint_kernels import FIELDS, ROWS, joint_block
+from scanner.paths.joint_kernels import FIELDS, ROWS, fit_workspace, joint_block
 from scanner.paths.joint_nearby import Profiles, workspace
-from scanner.paths.joint_seeds import PAIRS, seed_block
+from scanner.paths.joint_seeds import PAIRS, seed_block, seed_workspace
 from scanner.paths.kernels import Floats
 from scanner.paths.separation import CORES, separate_candidates
 from scanner.patterns import Axis
@@ -43,11 +44,14 @@ PRIORS = 3
 REFUSED_ONE_IN = 1e4
 """Of good fits one in so many is refused by its own χ²."""
 
-_BLOCK = 1024
+_BLOCK = 256
+"""Pixels that a thread works on at a time: their hypotheses stay in its cache."""
 _SURE, _SURE_SIGMAS = 7.0, 4.0
 """A hypothesis of the axis along that is e⁷ times as likely as its rival and fits needs no other seed,"""
 _CLOSE_PX = 48.0
 """unless its paths lie nearer to each other than this, where the axis along mistakes the fringe orders."""
+_ANYHOW = -math.inf, math.inf, 0.0
+"""Least lead over a rival, most χ², and least distance along of a pixel that is decided now: each is."""
 _UNKNOWN_LINE_PX, _LEAST_LINE_PX = 0.1, 0.02
 """Error of a calibrated rig where the scan itself does not show it, and the least that is believed, px."""
 _UNKNOWN_RATIO, _LEAST_RATIO = 0.05, 0.01
@@ -228,7 +232,7 @@ def separate_jointly(
     a, b = axes[along], axes[across]
     fits = separate_candidates(a.z, a.frequency, a.sigma_z, a.extent, a.gain)
     places = fits[:, :2].reshape(2 * len(fits), pixels.size)
-    other, slope = epipolar_crossings(rig, pixels, places, along)
+    other, slope = (np.ascontiguousarray(v, np.float64) for v in epipolar_crossings(rig, pixels, places, along))
     log_ratio = coupling.log_ratio if along == "x" else -coupling.log_ratio
     prior = np.array([0, 0, 0, coupling.line_px, log_ratio, coupling.ratio, _BOUNCE_RATIO])
     out = np.full((ROWS, pixels.size), np.nan, np.float32)
@@ -238,49 +242,51 @@ def separate_jointly(
     profiles_a, profiles_b = Profiles.of(comb_a), Profiles.of(comb_b)
     dof = 2 * (len(a.frequency) + len(b.frequency)) - 8 + PRIORS
 
-    def decide(these: NDArray[np.intp], fits_across: Floats) -> None:
+    def decide(these: NDArray[np.intp], fits_across: Floats, undecided_if: tuple[float, float, float]) -> None:
         if not these.size:
             return
-        z1, z2, s1, s2, first, place, rise = (_taken(v, these) for v in (za, zb, sigma_a, sigma_b, fits, other, slope))
-        found = np.full((ROWS, these.size), np.nan, np.float32)
         most = 2 * len(fits) + 2 * PAIRS * len(fits_across)
+        spare: SimpleQueue[Any] = SimpleQueue()
+        for _ in range(CORES):
+            near = workspace(profiles_a, profiles_b)
+            hypotheses = np.empty((_BLOCK, most, 8)), np.empty((_BLOCK, most, 3)), np.empty((_BLOCK, most))
+            for_seeds, for_fits = seed_workspace(len(za), len(zb), comb), fit_workspace(len(za), len(zb), most, near)
+            spare.put((for_seeds, *hypotheses, near, for_fits))
 
         def joint(start: int) -> None:
-            count = min(_BLOCK, these.size - start)
-            data = (
-                z1, z2, s1, s2, comb_a.gain, comb_b.gain, comb, -0.5, a.extent - 0.5, -0.5, b.extent - 0.5,
-            )  # fmt: skip
-            seeds, lines, bounds = np.empty((count, most, 8)), np.empty((count, most, 3)), np.empty((count, most))
-            seed_block(*data, first, place, rise, fits_across, prior, start, seeds, lines, bounds)
-            joint_block(
-                *data, seeds, lines, bounds, prior, LARGER_IS_DIRECT, *profiles_a.arrays, *profiles_b.arrays,
-                *workspace(profiles_a, profiles_b), found, start,
-            )  # fmt: skip
+            for_seeds, seeds, lines, bounds, near, for_fits = arrays = spare.get()
+            try:
+                data = (
+                    za, zb, sigma_a, sigma_b, comb_a.gain, comb_b.gain, comb, -0.5, a.extent - 0.5, -0.5,
+                    b.extent - 0.5, these[start : start + _BLOCK],
+                )  # fmt: skip
+                seed_block(*data, fits, other, slope, fits_across, prior, start, for_seeds, seeds, lines, bounds)
+                joint_block(
+                    *data, seeds, lines, bounds, prior, LARGER_IS_DIRECT, profiles_a.arrays, profiles_b.arrays, near,
+                    for_fits, undecided_if, out,
+                )  # fmt: skip
+            finally:
+                spare.put(arrays)
 
         with ThreadPoolExecutor(CORES) as pool:
             list(pool.map(joint, range(0, these.size, _BLOCK)))
-        out[:, these] = found
 
     def ask_across(these: NDArray[np.intp]) -> None:
         fits_across = separate_candidates(b.z[:, these], b.frequency, b.sigma_z[these], b.extent, b.gain)
-        decide(these, fits_across)
+        decide(these, fits_across, _ANYHOW)
         third[these] |= _too_many(fits_across, len(b.frequency))
 
     third = _too_many(fits, len(a.frequency))
     far = np.abs(fits[0, 0] - fits[0, 1]) > _CLOSE_PX
-    decide(np.flatnonzero(far), np.empty((0, *fits.shape[1:]), np.float32))
+    limits = _SURE, dof + _SURE_SIGMAS * math.sqrt(2 * dof), _CLOSE_PX
+    decide(np.flatnonzero(far), np.empty((0, *fits.shape[1:]), np.float32), limits)
     confidence, chi2 = out[2 * FIELDS], out[FIELDS - 1]
-    sure = far & (confidence > _SURE) & (chi2 < dof + _SURE_SIGMAS * math.sqrt(2 * dof))
+    sure = far & (confidence > limits[0]) & (chi2 < limits[1])
     ask_across(np.flatnonzero(~(sure & (np.abs(out[0] - out[1]) > _CLOSE_PX))))
     order = [0, 1] if along == "x" else [1, 0]
     best, rival = (_pair(out[k * FIELDS : (k + 1) * FIELDS], order) for k in range(2))
     fits_together = best.chi2 < chi2_distribution.isf(1 / REFUSED_ONE_IN, dof)
     return DirectPaths(best, rival, confidence, third & ~fits_together, dof, order[0])
-
-
-def _taken(values: NDArray[Any], these: NDArray[np.intp]) -> Any:
-    """Some pixels of (…, P) values, contiguous as the kernel wants them."""
-    return np.ascontiguousarray(values[..., these])
 
 
 def _pair(rows: Floats, order: list[int]) -> PathPair:

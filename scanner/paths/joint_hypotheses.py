@@ -7,16 +7,7 @@ from __future__ import annotations
 
 import math
 
-from scanner.paths.joint_fit import (
-    Phasors,
-    Reals,
-    backward,
-    factorise,
-    forward,
-    improve,
-    normal_equations,
-    variance,
-)
+from scanner.paths.joint_fit import Reals, covariance, improve, normal_equations, solve
 from scanner.paths.rotation import compiled
 
 HOPELESS_CHI2 = 16.0
@@ -46,36 +37,31 @@ def leads_to_known(thetas: Reals, step: Reals, scores: Reals, h: int, count: int
 
 @compiled  # pragma: no cover
 def propose(
-    ya: Phasors, wa: Reals, yb: Phasors, wb: Reals, comb: Reals, thetas: Reals, priors: Reals, normals: Reals,
-    gradients: Reals, chi2s: Reals, promised: Reals, steps: Reals, scores: Reals, factor: Reals, step: Reals,
-    nothing: Reals, h: int, least: float,
+    along: Reals, across: Reals, thetas: Reals, priors: Reals, systems: Reals, chi2s: Reals, gains: Reals,
+    promised: Reals, steps: Reals, scores: Reals, h: int, least: float,
 ) -> bool:  # fmt: skip
     """Take the first normal equations of the hypothesis ``h``; False where what they promise is hopeless."""
-    chi2s[h] = normal_equations(ya, wa, yb, wb, comb, priors[h], thetas[h], normals[h], gradients[h])
-    if not factorise(normals[h], 1e-9, nothing, factor):
+    chi2s[h] = normal_equations(along, across, priors[h], thetas[h], systems[h])
+    gains[h] = solve(systems[h], 0.0, steps[h])
+    promised[h] = chi2s[h] - gains[h]
+    if gains[h] < 0 or not promised[h] < least + HOPELESS_CHI2:
         return False
-    forward(factor, gradients[h], 0, step)
-    promised[h] = chi2s[h]
-    for k in range(8):
-        promised[h] -= step[k] * step[k]
-    if not promised[h] < least + HOPELESS_CHI2:
-        return False
-    backward(factor, step, steps[h])
     scores[h] = math.inf
     return True
 
 
 @compiled  # pragma: no cover
 def refine(
-    ya: Phasors, wa: Reals, yb: Phasors, wb: Reals, comb: Reals, thetas: Reals, priors: Reals, normals: Reals,
-    gradients: Reals, chi2s: Reals, promised: Reals, steps: Reals, scores: Reals, factor: Reals, step: Reals,
-    trial: Reals, normal2: Reals, slope2: Reals, nothing: Reals, unit: Reals, anywhere: Reals, low_a: float,
+    along: Reals, across: Reals, thetas: Reals, priors: Reals, systems: Reals, chi2s: Reals, gains: Reals,
+    promised: Reals, steps: Reals, scores: Reals, variances: Reals, trial: Reals, spare: Reals, low_a: float,
     high_a: float, low_b: float, high_b: float, larger_is_direct: float, first: int, count: int, least: float,
 ) -> float:  # fmt: skip
     """Refine the hypotheses first..count that are not hopeless and give them scores; returns the least χ².
 
     The most promising first: what it reaches shows which of the others are hopeless, and which lead to it.
     """
+    # No place is less known than anywhere in the picture.
+    place_a, place_b = 12 / (high_a - low_a) ** 2, 12 / (high_b - low_b) ** 2
     for _ in range(first, count):
         h = first + int(promised[first:count].argmin())
         if not promised[h] < least + HOPELESS_CHI2:
@@ -84,28 +70,20 @@ def refine(
         theta = thetas[h]
         if leads_to_known(thetas, steps[h], scores, h, count, SAME_FIT_PX):
             continue
-        chi2s[h], _ = improve(
-            ya, wa, yb, wb, comb, priors[h], theta, chi2s[h], _STEPS, normals[h], gradients[h],
-            factor, step, trial, normal2, slope2, nothing,
+        chi2s[h] = improve(
+            along, across, priors[h], theta, chi2s[h], gains[h], steps[h], systems[h], trial, spare, _STEPS,
         )  # fmt: skip
         least = min(least, chi2s[h])
         if not chi2s[h] < least + HOPELESS_CHI2:
             continue
         if not (low_a <= theta[0] < high_a and low_b <= theta[4] < high_b):
             continue
-        if not factorise(normals[h], 0.0, anywhere, factor):
+        determinant, mutual = covariance(systems[h], place_a, place_b, variances[h])
+        if not (determinant > 0 and theta[2] > _VISIBLE_SIGMAS * math.sqrt(variances[h, 2])):
             continue
         # Evidence by Laplace's method, with a scale-free prior on the amplitudes.
-        score = chi2s[h] + 2 * math.log(theta[2] + theta[3])
-        reciprocal = 1.0
-        for k in range(8):
-            reciprocal *= factor[k, k]
-            unit[k] = 1.0 if k == 2 else 0.0
-        score -= 2 * math.log(reciprocal)
-        if not theta[2] > _VISIBLE_SIGMAS * math.sqrt(variance(factor, unit, 2, step)):
-            continue
-        unit[3] = -1.0
-        lead = (theta[2] - theta[3]) / math.sqrt(max(variance(factor, unit, 2, step), _TINY))
+        score = chi2s[h] + 2 * math.log(theta[2] + theta[3]) - math.log(determinant)
+        lead = (theta[2] - theta[3]) / math.sqrt(max(variances[h, 2] + variances[h, 3] - 2 * mutual, _TINY))
         sure = 0.5 * math.erfc(-lead / math.sqrt(2.0))
         score -= 2 * math.log(larger_is_direct * sure + (1 - larger_is_direct) * (1 - sure))
         # A fit that is reached a second time is not twice as likely.

@@ -25,7 +25,10 @@ from scanner.paths.comb import Comb
 from scanner.paths.rotation import compiled, rotation
 
 Reals = NDArray[np.float64]
+Floats = NDArray[np.float32]
 Phasors = NDArray[np.complex128]
+Profile = tuple[Reals, Floats, Reals, Reals]
+Workspace = tuple[Reals, Reals, Reals, Reals, Reals, Floats, Floats, Reals, Reals, Reals]
 
 NEARBY = 8
 """Pairs of places that are handed on, the likeliest."""
@@ -37,6 +40,8 @@ _TRIED = 6
 """Of these the ones, the likeliest first, that are tried with each of the other axis."""
 _HOPELESS_CHI2 = 14.0
 """χ² above the best from which a place, or a pair, is hopeless."""
+_LANES = 16
+"""Numbers that a processor may take at a time: no row of a table has a remainder."""
 _STEP_RAD = 0.8
 """Step of the distances, as a phase: half of it costs 8 % of a path's power."""
 _CLOSEST_RAD = math.pi / 2
@@ -49,15 +54,15 @@ _FARTHEST_MOVE_RAD = 1.0
 
 @dataclass(frozen=True)
 class Profiles:
-    """What a bounce adds to a direct path on one axis, for G distances.
+    """What a bounce adds to a direct path on one axis, for G distances to one side; to the other it is conjugate.
 
     Parameters
     ----------
     distance
-        (G,) d, px.
+        (G,) d, px, ascending.
     table
-        (2T, G) real, then imaginary parts of √g e^{iωd} less what amplitude and place of the direct path can take of
-        it, of unit length.
+        (2, T, ≥ G) float32 real and imaginary part of √g e^{iωd} less what amplitude and place of the direct path can
+        take of it, of unit length; zero from G on.
     length
         (G,) its length before.
     taken
@@ -65,7 +70,7 @@ class Profiles:
     """
 
     distance: Reals
-    table: Reals
+    table: Floats
     length: Reals
     taken: Reals
 
@@ -74,32 +79,33 @@ class Profiles:
         """All distances up to 1/(TΔf), the least at which the modulation varies by a whole period."""
         omega = comb.carrier * (1 + comb.xi)
         reach = 2 * math.pi / (omega.size * comb.carrier * comb.step_rad)
-        half = np.arange(_CLOSEST_RAD, reach * comb.carrier, _STEP_RAD) / comb.carrier
-        distance = np.concatenate([-half[::-1], half])
+        distance = np.arange(_CLOSEST_RAD, reach * comb.carrier, _STEP_RAD) / comb.carrier
         root = comb.gain[:, None]
         wave = root * np.exp(1j * omega[:, None] * distance)
         place = root * omega[:, None]
         by_amplitude = (root * wave.real).sum(0) / (root**2).sum()
         by_place = (place * wave.imag).sum(0) / (place**2).sum()
-        rest = np.concatenate([wave.real - root * by_amplitude, wave.imag - place * by_place])
-        length = np.sqrt((rest**2).sum(0))
-        return cls(distance, np.ascontiguousarray(rest / length), length, np.stack([by_amplitude, by_place]))
+        rest = np.stack([wave.real - root * by_amplitude, wave.imag - place * by_place])
+        length = np.sqrt((rest**2).sum((0, 1)))
+        table = np.zeros((2, omega.size, -(-distance.size // _LANES) * _LANES), np.float32)
+        table[:, :, : distance.size] = rest / length
+        return cls(distance, table, length, np.stack([by_amplitude, by_place]))
 
     @property
-    def arrays(self) -> tuple[Reals, Reals, Reals, Reals]:
+    def arrays(self) -> Profile:
         """As the kernel takes them."""
         return self.distance, self.table, self.length, self.taken
 
 
 @compiled  # pragma: no cover
-def _insert(found: Reals, first: int, count: int, most: int, key: int, row: Reals) -> int:
-    """Put a row into the list ``found[first:count]``, which ascends in its column ``key``; returns the new count."""
+def _insert(found: Reals, first: int, count: int, most: int, row: Reals) -> int:
+    """Put a row into the list ``found[first:count]``, which ascends in χ², its first column; returns the new count."""
     if count - first == most:
-        if not row[key] < found[count - 1, key]:
+        if not row[0] < found[count - 1, 0]:
             return count
         count -= 1
     place = count
-    while place > first and row[key] < found[place - 1, key]:
+    while place > first and row[0] < found[place - 1, 0]:
         for m in range(row.size):
             found[place, m] = found[place - 1, m]
         place -= 1
@@ -129,84 +135,134 @@ def _far_bounce(x: Reals, gain: Reals, sigma: float, omega0: float, step: float,
 
 
 @compiled  # pragma: no cover
+def _explained(x: Reals, table: Floats, power: Floats) -> None:
+    """Square roots of the power that a bounce at each distance explains, (2, G): to the one side, and to the other."""
+    count, size = table.shape[1], table.shape[2]
+    for j in range(size):
+        power[0, j] = power[1, j] = np.float32(0)
+    for t in range(0, count - 2, 3):
+        # Three at a time, because fetching the sums takes longer than adding to them.
+        r0, r1, r2 = np.float32(x[t]), np.float32(x[t + 1]), np.float32(x[t + 2])
+        i0, i1, i2 = np.float32(x[count + t]), np.float32(x[count + t + 1]), np.float32(x[count + t + 2])
+        for j in range(size):
+            power[0, j] += r0 * table[0, t, j] + r1 * table[0, t + 1, j] + r2 * table[0, t + 2, j]
+            power[1, j] += i0 * table[1, t, j] + i1 * table[1, t + 1, j] + i2 * table[1, t + 2, j]
+    for t in range(count - count % 3, count):
+        r0, i0 = np.float32(x[t]), np.float32(x[count + t])
+        for j in range(size):
+            power[0, j] += r0 * table[0, t, j]
+            power[1, j] += i0 * table[1, t, j]
+    for j in range(size):
+        even, odd = power[0, j], power[1, j]
+        power[0, j], power[1, j] = even + odd, even - odd
+
+
+@compiled  # pragma: no cover
+def _peaks(power: Floats, floor: float, last: int, peaks: Floats) -> None:
+    """Maxima of ``power`` above a floor, zero elsewhere. At the ends, and beside the direct path, there are none."""
+    least, nothing = np.float32(floor), np.float32(0)
+    for side in range(2):
+        for j in range(1, last):
+            before, here, after = power[side, j - 1], power[side, j], power[side, j + 1]
+            peaks[side, j] = here if (here > least) & (here >= before) & (here > after) else nothing
+
+
+@compiled  # pragma: no cover
+def _set_place(
+    row: Reals, chi2: float, u1: float, d: float, a1: float, a2: float, information: float, by_place: float,
+    moved: float, omega0: float,
+) -> bool:  # fmt: skip
+    """Write a place of the bounce as a row of `_places`; False where the direct path is none or another then."""
+    move = (moved - a2 * by_place) / a1
+    if not (a1 > 0 and abs(move) * omega0 < _FARTHEST_MOVE_RAD):
+        return False
+    row[0], row[1], row[2], row[3] = chi2, u1 + move, u1 + d, a1
+    row[4], row[5], row[6], row[7] = a2, information, math.inf, by_place
+    return True
+
+
+@compiled  # pragma: no cover
 def _places(
     y: Phasors, gain: Reals, sigma: float, omega0: float, step: float, u1: float, u2: float, only_u2: bool,
-    distance: Reals, table: Reals, length: Reals, taken: Reals, x: Reals, power: Reals, row: Reals, found: Reals,
-    count: int, limit: float,
+    profile: Profile, scratch: tuple[Reals, Floats, Floats, Reals], found: Reals, order: Reals, count: int,
+    limit: float,
 ) -> int:  # fmt: skip
     """Places of the bounce about the direct place u₁ that are local maxima of the likelihood, as rows of ``found``.
 
     A bounce at u₂ is one of them where the profiles do not reach it, and with ``only_u2`` the only one. Of a row: χ²,
     u₁, u₂, a₁, a₂, information of a₂, room for the χ² of a pair, what a bounce of unit amplitude takes of a₁ δu. Places
-    of a χ² above ``limit`` are none. Returns the new number of rows; the first ``count`` stay.
+    of a χ² above ``limit`` are none. Returns the new number of rows; the first ``count`` stay, and ``order`` lists χ²
+    and number of the others.
     """
+    distance, table, length, taken = profile
+    x, power, peaks, row = scratch
     e, turn = rotation(-omega0 * u1), rotation(-step * u1)
     total = own = moved = s0 = s2 = 0.0
+    reciprocal = 1 / sigma
     for t in range(y.size):
-        q, root, omega = e * y[t], gain[t] / sigma, omega0 + t * step
+        q, root, omega = e * y[t], gain[t] * reciprocal, omega0 + t * step
         x[t], x[y.size + t] = root * q.real, root * q.imag
-        total += root * root * (q.real * q.real + q.imag * q.imag)
-        own += root * root * q.real
-        moved += root * root * omega * q.imag
+        total += x[t] * x[t] + x[y.size + t] * x[y.size + t]
+        own += root * x[t]
+        moved += root * omega * x[y.size + t]
         s0 += root * root
         s2 += root * root * omega * omega
         e *= turn
     own, moved = own / s0, moved / s2
     total -= own * own * s0 + moved * moved * s2
-    last = 0 if only_u2 else distance.size - 1
-    if not only_u2:
-        for j in range(distance.size):
-            power[j] = 0.0
-        for k in range(2 * y.size):
-            for j in range(distance.size):
-                power[j] += x[k] * table[k, j]
-    first, floor = count, math.sqrt(max(total - limit, 0.0))
-    for j in range(last + 1):
-        if j == 0:
-            # In the place of the end of the profiles, which can be no maximum, the bounce that is beyond.
-            d = u2 - u1
-            if not abs(d) > distance[distance.size - 1]:
-                continue
-            amount, size, by_amplitude, by_place = _far_bounce(x, gain, sigma, omega0, step, d, s0, s2)
-        else:
-            if j == last or not (power[j] > floor and power[j] >= power[j - 1] and power[j] > power[j + 1]):
-                continue
-            if distance[j - 1] * distance[j + 1] < 0:
-                # Beside the gap about the direct path a maximum is none.
-                continue
-            d, amount, size = distance[j], power[j], length[j] / sigma
-            by_amplitude, by_place = taken[0, j], taken[1, j]
+    first, last = count, distance.size - 1
+    if abs(u2 - u1) > distance[last]:
+        amount, size, by_amplitude, by_place = _far_bounce(x, gain, sigma, omega0, step, u2 - u1, s0, s2)
         chi2, a2 = total - amount * amount, amount / size
         a1 = own - a2 * by_amplitude
-        if not (amount > floor and a1 > 0):
-            continue
-        move = (moved - a2 * by_place) / a1
-        if not abs(move) * omega0 < _FARTHEST_MOVE_RAD:
-            continue
-        if chi2 + _HOPELESS_CHI2 < limit:
-            limit = chi2 + _HOPELESS_CHI2
-            floor = math.sqrt(max(total - limit, 0.0))
-        row[0], row[1], row[2], row[3] = chi2, u1 + move, u1 + d, a1
-        row[4], row[5], row[7] = a2, size * size, by_place
-        count = _insert(found, first, count, _PLACES, 0, row[:8])
+        if (
+            amount > 0
+            and chi2 < limit
+            and _set_place(found[count], chi2, u1, u2 - u1, a1, a2, size * size, by_place, moved, omega0)
+        ):
+            limit = min(limit, chi2 + _HOPELESS_CHI2)
+            row[0], row[1] = chi2, count
+            count = _insert(order, first, count, _PLACES, row[:2])
+    if only_u2:
+        return count
+    _explained(x, table, power)
+    _peaks(power, math.sqrt(max(total - limit, 0.0)), last, peaks)
+    for side in range(2):
+        sign = 1 - 2 * side
+        for j in range(1, last):
+            amount = peaks[side, j]
+            if not amount > 0:
+                continue
+            chi2, size = total - amount * amount, length[j] * reciprocal
+            a2 = amount / size
+            if (
+                chi2 < limit
+                and count - first < _PLACES
+                and _set_place(
+                    found[count], chi2, u1, sign * distance[j], own - a2 * taken[0, j], a2, size * size,
+                    sign * taken[1, j], moved, omega0,
+                )
+            ):  # fmt: skip
+                limit = min(limit, chi2 + _HOPELESS_CHI2)
+                row[0], row[1] = chi2, count
+                count = _insert(order, first, count, _PLACES, row[:2])
     return count
 
 
 @compiled  # pragma: no cover
 def nearby(
     ya: Phasors, yb: Phasors, gain_a: Reals, gain_b: Reals, sigma_a: float, sigma_b: float, comb: Reals, theta: Reals,
-    chi2_of_theta: float, prior: Reals, distance_a: Reals, table_a: Reals, length_a: Reals, taken_a: Reals,
-    distance_b: Reals, table_b: Reals, length_b: Reals, taken_b: Reals, along: Reals, across: Reals, x: Reals,
-    power_a: Reals, power_b: Reals, row: Reals, posterior_a: Reals, posterior_b: Reals, known_a: int, known_b: int,
-    found: Reals, reach: int, per_fringe: int,
+    chi2_of_theta: float, prior: Reals, profile_a: Profile, profile_b: Profile, work: Workspace, known_a: int,
+    known_b: int, found: Reals, reach: int, per_fringe: int,
 ) -> Any:  # fmt: skip
     """Starts near the fit ``theta`` as rows (u₁, u₂, a₁, a₂ along and across) of ``found`` (NEARBY, 9); χ² is last.
 
     The direct place is tried ``reach`` steps to either side, ``per_fringe`` of which are one fringe.
-    The arrays after ``prior`` are `Profiles.arrays` of both axes, and `workspace`. Returns how many starts there are,
-    and the new lengths of ``posterior_a`` and ``posterior_b``: χ², direct place on the axis, its σ, by place of the
-    bounce.
+    The profiles are `Profiles.arrays` of both axes, ``work`` is `workspace`. Returns how many starts there are, and the
+    new lengths of the last two arrays of ``work``: χ², direct place along or across, its σ, by place of the bounce.
     """
+    along, across, order_a, order_b, x, power, peaks, row, posterior_a, posterior_b = work
+    distance_a, distance_b, scratch = profile_a[0], profile_b[0], (x, power, peaks, row)
     # A bounce that is far and clear leaves no room for another one.
     clear_a = abs(theta[1] - theta[0]) > distance_a[-1] and theta[3] > _CLEAR_SIGMAS * sigma_a
     clear_b = abs(theta[5] - theta[4]) > distance_b[-1] and theta[7] > _CLEAR_SIGMAS * sigma_b
@@ -214,8 +270,8 @@ def nearby(
         return 0, known_a, known_b
     limit = chi2_of_theta + _HOPELESS_CHI2
     columns = _places(
-        yb, gain_b, sigma_b, comb[2], comb[3], theta[4], theta[5], clear_b, distance_b, table_b, length_b, taken_b,
-        x, power_b, row, across, 0, limit,
+        yb, gain_b, sigma_b, comb[2], comb[3], theta[4], theta[5], clear_b, profile_b, scratch, across, order_b, 0,
+        limit,
     )  # fmt: skip
     if columns == 0:
         return 0, known_a, known_b
@@ -225,30 +281,28 @@ def nearby(
         # The middle first; the line leaves the order across it no choice.
         order = (-((number + 1) // 2) if number % 2 else number // 2) / per_fringe
         rows = _places(
-            ya, gain_a, sigma_a, comb[0], comb[1], theta[0] + order * fringe, theta[1], clear_a, distance_a, table_a,
-            length_a, taken_a, x, power_a, row, along, rows, limit - across[0, 0],
+            ya, gain_a, sigma_a, comb[0], comb[1], theta[0] + order * fringe, theta[1], clear_a, profile_a, scratch,
+            along, order_a, rows, limit - order_b[0, 0],
         )  # fmt: skip
     kappa, count = math.exp(prior[4]), 0
-    for i in range(rows):
-        along[i, 6] = math.inf
-    for j in range(columns):
-        across[j, 6] = math.inf
-    for i in range(rows):
-        for j in range(columns):
-            if i >= _TRIED and j >= _TRIED:
+    for m in range(rows):
+        for n in range(columns):
+            if not order_a[m, 0] + order_b[n, 0] < limit or (m >= _TRIED and n >= _TRIED):
                 break
-            if not along[i, 0] + across[j, 0] < limit:
-                break
+            i, j = int(order_a[m, 1]), int(order_b[n, 1])
             a2, b2 = kappa * along[i, 4], across[j, 4]
             spread = kappa * kappa / along[i, 5] + 1 / across[j, 5] + (prior[6] * max(a2, b2)) ** 2
             chi2 = along[i, 0] + across[j, 0] + (a2 - b2) ** 2 / spread
             if not chi2 < limit:
                 continue
             along[i, 6], across[j, 6] = min(along[i, 6], chi2), min(across[j, 6], chi2)
-            for m in range(4):
-                row[m], row[4 + m] = along[i, 1 + m], across[j, 1 + m]
-            row[8] = chi2
-            count = _insert(found, 0, count, NEARBY, 8, row)
+            row[0], row[1], row[2] = chi2, i, j
+            count = _insert(found, 0, count, NEARBY, row)
+    for n in range(count):
+        chi2, i, j = found[n, 0], int(found[n, 1]), int(found[n, 2])
+        for m in range(4):
+            found[n, m], found[n, 4 + m] = along[i, 1 + m], across[j, 1 + m]
+        found[n, 8] = chi2
     known_a = _posterior(along, rows, gain_a, sigma_a, comb[0], comb[1], posterior_a, known_a)
     known_b = _posterior(across, columns, gain_b, sigma_b, comb[2], comb[3], posterior_b, known_b)
     return count, known_a, known_b
@@ -271,19 +325,20 @@ def _posterior(
     return known
 
 
-def workspace(
-    profiles_a: Profiles, profiles_b: Profiles
-) -> tuple[Reals, Reals, Reals, Reals, Reals, Reals, Reals, Reals]:
+def workspace(profiles_a: Profiles, profiles_b: Profiles) -> Workspace:
     """Arrays that `nearby` works in; one set a thread."""
-    longest = max(len(profiles_a.table), len(profiles_b.table))
+    _, count, size = np.maximum(profiles_a.table.shape, profiles_b.table.shape)
+    most = (2 * _MOST_REACH + 1) * _PLACES
     return (
-        np.empty(((2 * _MOST_REACH + 1) * _PLACES, 8)),
+        np.empty((most, 8)),
         np.empty((_PLACES, 8)),
-        np.empty(longest),
-        np.empty(profiles_a.distance.size),
-        np.empty(profiles_b.distance.size),
-        np.empty(9),
+        np.empty((most, 2)),
+        np.empty((_PLACES, 2)),
+        np.empty(2 * count),
+        np.empty((2, size), np.float32),
+        np.empty((2, size), np.float32),
+        np.empty(3),
         # Of three calls, two of which reach one step to either side.
-        np.empty(((2 * _MOST_REACH + 7) * _PLACES, 3)),
+        np.empty((most + 6 * _PLACES, 3)),
         np.empty((3 * _PLACES, 3)),
     )

@@ -14,16 +14,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.paths.folding import COLUMNS, fold, sums
+from scanner.paths.joint_place import ORDERS, lone_path, order_turns, wave_of
 from scanner.paths.rotation import compiled, rotation
 
 Floats = NDArray[np.float32]
 Reals = NDArray[np.float64]
 Phasors = NDArray[np.complex128]
+Numbers = NDArray[np.intp]
+SeedWorkspace = tuple[
+    Phasors, Phasors, Phasors, Reals, Reals, Reals, Reals, Reals, Reals, Phasors, Phasors
+]  # fmt: skip
 
 PAIRS = 4
 """Pairs of places along the line that are kept of those with the amplitudes of one fit across."""
-_ORDERS = 2
-"""Fringe orders tried to either side of what the pole of the rest says."""
 _NEAR_LINE_PX, _NEAR_LINE_SIGMAS = 3.0, 6.0
 """How far from the line a fit of the axis across may lie and still be tried."""
 _APART_PX = 80.0
@@ -36,52 +40,21 @@ _SAME_PX = 2.0
 """Starts this near to each other in all places lead to one and the same fit."""
 
 
-@compiled  # pragma: no cover
-def order_turns(count: int, omega0: float, step: float) -> Phasors:
-    """(_ORDERS, T) turn, at each frequency, of a path that lies one, two, … fringes of the middle one further on."""
-    turns = np.empty((_ORDERS, count), np.complex128)
-    centre = omega0 + 0.5 * (count - 1) * step
-    for k in range(_ORDERS):
-        for t in range(count):
-            turns[k, t] = rotation(2 * math.pi * (k + 1) * (omega0 + t * step - centre) / centre)
-    return turns
-
-
-@compiled  # pragma: no cover
-def _place(
-    left: Phasors, g: Reals, lag: complex, omega0: float, step: float, turns: Phasors, orders: int, low: float,
-    high: float,
-) -> Any:  # fmt: skip
-    """Place of the one path in ``left``, whose pole has the angle of ``lag``, and Σ g times its amplitude there.
-
-    Of the place that the phase at the middle frequency gives and of ``orders`` fringes to either side that where there
-    is most light; -inf where none of them lies within the picture.
-    """
-    centre, period = omega0 + 0.5 * (left.size - 1) * step, 2 * math.pi / step
-    coarse = math.atan2(lag.imag, lag.real) / step
-    coarse -= period * math.floor((coarse - 0.5 * (low + high)) / period + 0.5)
-    e, turn, c = rotation(-omega0 * coarse), rotation(-step * coarse), 0j
-    for t in range(left.size):
-        c += g[t] * (e * left[t])
-        e *= turn
-    fine = coarse + math.atan2(c.imag, c.real) / centre
-    e, turn = rotation(-omega0 * fine), rotation(-step * fine)
-    here = up1 = up2 = down1 = down2 = 0.0
-    for t in range(left.size):
-        r = g[t] * (e * left[t])
-        here += r.real
-        # A path k fringes on is turned by as much one way as one k fringes back is the other.
-        even, odd = r.real * turns[0, t].real, r.imag * turns[0, t].imag
-        up1, down1 = up1 + (even + odd), down1 + (even - odd)
-        even, odd = r.real * turns[1, t].real, r.imag * turns[1, t].imag
-        up2, down2 = up2 + (even + odd), down2 + (even - odd)
-        e *= turn
-    place, most = fine, -math.inf
-    for k, s in ((-2, down2), (-1, down1), (0, here), (1, up1), (2, up2)):
-        u = fine + k * 2 * math.pi / centre
-        if s > most and abs(k) <= orders and low <= u < high:
-            place, most = u, s
-    return place, most
+def seed_workspace(count_a: int, count_b: int, comb: Reals) -> SeedWorkspace:
+    """Arrays that `seed_block` works in, of so many frequencies along and across; one set a thread."""
+    return (
+        np.empty(count_a, np.complex128),
+        np.empty(count_b, np.complex128),
+        np.empty(max(count_a, count_b), np.complex128),
+        np.empty((2, count_a)),
+        np.empty(count_a),
+        np.empty(count_b),
+        np.empty((PAIRS, 4)),
+        np.empty((PAIRS, 3)),
+        np.empty((count_a // 2 + 2, COLUMNS)),
+        order_turns(count_a, comb[0], comb[1]),
+        order_turns(count_b, comb[2], comb[3]),
+    )
 
 
 @compiled  # pragma: no cover
@@ -89,52 +62,42 @@ def _rest(
     zb: Phasors, gb: Reals, comb: Reals, turns: Phasors, u1: float, a1: float, low: float, high: float, left: Phasors
 ) -> Any:  # fmt: skip
     """Place and amplitude of the one path in what the path (u₁, a₁) leaves of an axis; amplitude 0 where none is."""
-    omega0, step = comb[2], comb[3]
-    e, turn = rotation(omega0 * u1), rotation(step * u1)
-    lag, total = 0j, 0.0
-    for t in range(zb.size):
-        left[t] = zb[t] - a1 * e
+    left = left[: zb.size]
+    wave_of(u1, comb[2], comb[3], left)
+    lag, total = 0j, gb[0]
+    left[0] = zb[0] - a1 * left[0]
+    for t in range(1, zb.size):
+        left[t] = zb[t] - a1 * left[t]
         total += gb[t]
-        if t > 0:
-            lag += gb[t] * (left[t] * left[t - 1].conjugate())
-        e *= turn
-    place, most = _place(left[: zb.size], gb, lag, omega0, step, turns, _ORDERS, low, high)
+        lag += gb[t] * (left[t] * left[t - 1].conjugate())
+    place, most = lone_path(left, gb, lag, comb[2], comb[3], turns, ORDERS, low, high)
     return place, max(most, 0.0) / total
 
 
 @compiled  # pragma: no cover
 def _pair_at(
-    ya: Phasors, ga: Reals, comb: Reals, turns: Phasors, a1: float, a2: float, apart: float, low: float, high: float,
-    left: Phasors,
+    ya: Phasors, ga: Reals, folded: Reals, comb: Reals, turns: Phasors, a1: float, a2: float, apart: float, low: float,
+    high: float, left: Phasors,
 ) -> Any:  # fmt: skip
     """Places of two paths of known amplitudes that are about ``apart`` from each other, and their χ²."""
-    omega0, step = comb[0], comb[1]
-    e, turn, lag = rotation(omega0 * apart), rotation(step * apart), 0j
-    for t in range(ya.size):
-        left[t] = ya[t] * (a1 + a2 * e).conjugate()
-        if t > 0:
-            lag += ga[t] * (left[t] * left[t - 1].conjugate())
-        e *= turn
-    u1, _ = _place(left[: ya.size], ga, lag, omega0, step, turns, 1, low, high)
-    u2 = u1 + apart
-    e1, turn1, e2, turn2 = rotation(omega0 * u1), rotation(step * u1), rotation(omega0 * u2), rotation(step * u2)
-    chi2 = n11 = n12 = n22 = s1 = s2 = 0.0
-    for t in range(ya.size):
-        off, w, omega = ya[t] - a1 * e1 - a2 * e2, ga[t], omega0 + t * step
-        chi2 += w * (off.real * off.real + off.imag * off.imag)
-        w *= omega
-        s1 += w * a1 * (e1.conjugate() * off).imag
-        s2 += w * a2 * (e2.conjugate() * off).imag
-        w *= omega
-        n11 += w * a1 * a1
-        n22 += w * a2 * a2
-        n12 += w * a1 * a2 * (e1.conjugate() * e2).real
-        e1 *= turn1
-        e2 *= turn2
+    left = left[: ya.size]
+    wave_of(apart, comb[0], comb[1], left)
+    lag = 0j
+    left[0] = ya[0] * (a1 + a2 * left[0]).conjugate()
+    for t in range(1, ya.size):
+        left[t] = ya[t] * (a1 + a2 * left[t]).conjugate()
+        lag += ga[t] * (left[t] * left[t - 1].conjugate())
+    u1, _ = lone_path(left, ga, lag, comb[0], comb[1], turns, 1, low, high)
+    u2, last = u1 + apart, folded.shape[0] - 1
+    power, s0, s2 = folded[last, 0], folded[last, 1], folded[last, 2]
+    c1, c2, f1, f2, m0, m1, m2 = sums(folded, u1, u2)
+    chi2 = power + (a1 * a1 + a2 * a2) * s0 + 2 * (a1 * a2 * m0 - a1 * c1 - a2 * c2)
+    n11, n12, n22 = a1 * a1 * s2, a1 * a2 * m2, a2 * a2 * s2
+    s1, s2 = a1 * (f1 - a2 * m1), a2 * (f2 + a1 * m1)
     # One Gauss-Newton step, half a radian at most, and what it promises.
     inverse = 1 / (n11 * n22 * (1 + 1e-3) - n12 * n12)
     d1, d2 = inverse * (n22 * s1 - n12 * s2), inverse * (n11 * s2 - n12 * s1)
-    shorten = 1 / max(1.0, 2 * omega0 * max(abs(d1), abs(d2)))
+    shorten = 1 / max(1.0, 2 * comb[0] * max(abs(d1), abs(d2)))
     gain = shorten * (2 - shorten) * (s1 * d1 + s2 * d2)
     return u1 + shorten * d1, u2 + shorten * d2, chi2 - gain
 
@@ -177,8 +140,8 @@ def _distance(power: Reals, weight: Reals, comb: Reals, a1: float, a2: float, si
 
 @compiled  # pragma: no cover
 def _pairs(
-    ya: Phasors, ga: Reals, comb: Reals, turns: Phasors, a1: float, bounce: float, sigma_bounce: float, low: float,
-    high: float, left: Phasors, moduli: Reals, distances: Reals, found: Reals,
+    ya: Phasors, ga: Reals, folded: Reals, comb: Reals, turns: Phasors, a1: float, bounce: float, sigma_bounce: float,
+    low: float, high: float, left: Phasors, moduli: Reals, distances: Reals, found: Reals,
 ) -> None:  # fmt: skip
     """Places u₁, u₂ along the line for two paths of amplitudes a₁ and about ``bounce``.
 
@@ -212,7 +175,7 @@ def _pairs(
         if not least < min(distances[0, 0], found[0, 0]) + _HOPELESS_CHI2:
             break
         apart = -distances[number // 2, 1] if number % 2 else distances[number // 2, 1]
-        u1, u2, chi2 = _pair_at(ya, ga, comb, turns, a1, a2, apart, low, high, left)
+        u1, u2, chi2 = _pair_at(ya, ga, folded, comb, turns, a1, a2, apart, low, high, left)
         if not (low <= u1 < high and low <= u2 < high):
             continue
         place = PAIRS - 1
@@ -245,24 +208,21 @@ def _known(thetas: Reals, count: int) -> bool:
 @compiled  # pragma: no cover
 def seed_block(
     za: NDArray[np.complex64], zb: NDArray[np.complex64], sigma_a: Reals, sigma_b: Reals, gain_a: Reals, gain_b: Reals,
-    comb: Reals, low_a: float, high_a: float, low_b: float, high_b: float, fits: Floats, other: Reals, slopes: Reals,
-    fits_across: Floats, prior: Reals, start: int, seeds: Reals, lines: Reals, bounds: Reals,
+    comb: Reals, low_a: float, high_a: float, low_b: float, high_b: float, numbers: Numbers, fits: Floats,
+    other: Reals, slopes: Reals, fits_across: Floats, prior: Reals, start: int, work: SeedWorkspace, seeds: Reals,
+    lines: Reals, bounds: Reals,
 ) -> None:  # fmt: skip
-    """Hypotheses of the pixels from ``start`` on, as many as ``bounds`` has rows.
+    """Hypotheses of the pixels ``numbers`` (n,), of which ``fits_across`` holds those from ``start`` on.
 
     ``seeds`` (n, most, 8) get u₁, u₂, a₁, a₂ along and across, path 1 direct; ``lines`` (n, most, 3) a place along, the
     place across that the line gives to it, and the line's slope; ``bounds`` (n, most) what χ² will hardly fall below,
     infinite where there is no more hypothesis.
     """
     count_a, count_b, kinds, kinds_across = za.shape[0], zb.shape[0], fits.shape[0], fits_across.shape[0]
-    ya, yb = np.empty(count_a, np.complex128), np.empty(count_b, np.complex128)
-    left, moduli = np.empty(max(count_a, count_b), np.complex128), np.empty((2, count_a))
-    ga, gb = np.empty(count_a), np.empty(count_b)
-    pairs, distances = np.empty((PAIRS, 4)), np.empty((PAIRS, 3))
-    turns_a, turns_b = order_turns(count_a, comb[0], comb[1]), order_turns(count_b, comb[2], comb[3])
+    ya, yb, left, moduli, ga, gb, pairs, distances, folded, turns_a, turns_b = work
     kappa = math.exp(prior[4])
-    for n in range(bounds.shape[0]):
-        p = start + n
+    for n in range(numbers.size):
+        p, q = numbers[n], start + n
         for t in range(count_a):
             ya[t], ga[t] = (1 / gain_a[t]) * za[t, p], (gain_a[t] / sigma_a[p]) ** 2
         for t in range(count_b):
@@ -285,21 +245,23 @@ def seed_block(
                 # Both axes together cannot fit better than this one alone.
                 bounds[n, tried] = fits[k, 7, p]
                 tried += 1
+        if kinds_across > 0:
+            fold(ya, gain_a, sigma_a[p], comb[0], comb[1], folded)
         for k in range(kinds_across):
             for i in range(2):
-                b1, b2 = fits_across[k, 2 + i, p], fits_across[k, 3 - i, p]
-                allowed = _NEAR_LINE_PX + _NEAR_LINE_SIGMAS * (prior[3] + fits_across[k, 4 + i, p])
-                if not (fits_across[k, 7, p] < fits_across[0, 7, p] + _HOPELESS_CHI2 and b1 > 0):
+                b1, b2 = fits_across[k, 2 + i, q], fits_across[k, 3 - i, q]
+                allowed = _NEAR_LINE_PX + _NEAR_LINE_SIGMAS * (prior[3] + fits_across[k, 4 + i, q])
+                if not (fits_across[k, 7, q] < fits_across[0, 7, q] + _HOPELESS_CHI2 and b1 > 0):
                     continue
                 off = math.inf
                 for m in range(other.shape[0]):
                     if math.isfinite(other[m, p]):
-                        off = min(off, abs(fits_across[k, i, p] - other[m, p]) - _APART_PX * abs(slopes[m, p]))
+                        off = min(off, abs(fits_across[k, i, q] - other[m, p]) - _APART_PX * abs(slopes[m, p]))
                 if not off < allowed:
                     continue
                 _pairs(
-                    ya, ga, comb, turns_a, b1 / kappa, b2 / kappa, prior[6], low_a, high_a, left, moduli, distances,
-                    pairs,
+                    ya, ga, folded, comb, turns_a, b1 / kappa, b2 / kappa, prior[6], low_a, high_a, left, moduli,
+                    distances, pairs,
                 )  # fmt: skip
                 for j in range(PAIRS):
                     # The line through the place nearest to where it is known.
@@ -312,13 +274,13 @@ def seed_block(
                         continue
                     there, s = fits[nearest // 2, nearest % 2, p], slopes[nearest, p]
                     place = other[nearest, p] + s * (pairs[j, 1] - there)
-                    if not abs(fits_across[k, i, p] - place) < allowed * math.sqrt(1 + s * s):
+                    if not abs(fits_across[k, i, q] - place) < allowed * math.sqrt(1 + s * s):
                         continue
                     theta = seeds[n, tried]
                     theta[0], theta[1], theta[2], theta[3] = pairs[j, 1], pairs[j, 2], b1 / kappa, pairs[j, 3]
-                    theta[4], theta[5], theta[6], theta[7] = fits_across[k, i, p], fits_across[k, 1 - i, p], b1, b2
+                    theta[4], theta[5], theta[6], theta[7] = fits_across[k, i, q], fits_across[k, 1 - i, q], b1, b2
                     if _known(seeds[n], tried):
                         continue
                     lines[n, tried, 0], lines[n, tried, 1], lines[n, tried, 2] = theta[0], place, s
-                    bounds[n, tried] = fits_across[k, 7, p]
+                    bounds[n, tried] = fits_across[k, 7, q]
                     tried += 1

@@ -2,8 +2,9 @@
 
 A coordinate is carried as the phase v = 2πf_c u (rad) and a frequency as ξ_t = f_t/f_c - 1; the phasors are divided by
 the trend m_t, which leaves the weights g_t = m_t². Amplitudes enter linearly and are eliminated in every fit (variable
-projection, Golub & Pereyra 1973), which leaves 2 x 2 systems in closed form. They live in one file because Numba's
-cache of a kernel looks at its own file only.
+projection, Golub & Pereyra 1973), which leaves 2 x 2 systems in closed form.
+
+Numba's cache of `separate_block` does not see the files of what it calls: `make` compiles it anew.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scanner.paths.folding import COLUMNS, fold, sums, turned_sum, turned_sums
 from scanner.paths.pencil import poles
-from scanner.paths.rotation import compiled, rotation
+from scanner.paths.rotation import angle_of, compiled, rotation
 
 Floats = NDArray[np.float32]
 Reals = NDArray[np.float64]
 Phasors = NDArray[np.complex128]
+Workspace = tuple[Phasors, Phasors, Reals, Reals, Reals, Reals, Reals, Reals, Reals]
 
 CANDIDATES = 3
 """Fits that are kept of a pixel, the best one first."""
@@ -91,52 +94,29 @@ def _float_fit(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float) -> Any:
 
 
 @compiled  # pragma: no cover
-def _residues(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float) -> Any:
+def _residues(folded: Reals, v1: float, v2: float) -> Any:
     """ρ₁ and ρ₂ of `_float_fit` alone."""
-    dx = xi[1] - xi[0]
-    e1, turn1 = rotation(-xi[0] * v1), rotation(-dx * v1)
-    e2, turn2 = rotation(-xi[0] * v2), rotation(-dx * v2)
-    c1 = c2 = m0 = 0j
-    s0 = 0.0
-    for t in range(y.size):
-        w1 = g[t] * e1
-        c1 += w1 * y[t]
-        c2 += g[t] * (e2 * y[t])
-        m0 += w1 * e2.conjugate()
-        s0 += g[t]
-        e1 *= turn1
-        e2 *= turn2
+    last = folded.shape[0] - 1
+    # ξ of the middle frequency is not zero where the weights are skew.
+    xi, s0 = folded[last, 3] - 1, folded[last, 1]
+    c1, c2, m0 = turned_sums(folded, v1, v2)
     inverse = 1 / max(s0 * s0 - (m0.real**2 + m0.imag**2), _REGULAR * s0 * s0)
-    return inverse * (s0 * c1 - m0 * c2), inverse * (s0 * c2 - m0.conjugate() * c1)
+    # The turns at the middle frequency, which c and m₀ are taken over, are those of ρ.
+    r1, r2 = inverse * (s0 * c1 - m0 * c2), inverse * (s0 * c2 - m0.conjugate() * c1)
+    return rotation(-xi * v1) * r1, rotation(-xi * v2) * r2
 
 
 @compiled  # pragma: no cover
-def _fixed_fit(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float) -> Any:
+def _fixed_fit(folded: Reals, v1: float, v2: float) -> Any:
     """Least squares of y_t = a₁ e^{i(1+ξ_t)v₁} + a₂ e^{i(1+ξ_t)v₂} with real a, for weights g.
 
     Returns a₁, a₂, the explained power (-1 unless both amplitudes are positive), the diagonal and the off-diagonal
     element of the information matrix of (a₁v₁, a₂v₂), the gradient of half the power to these, and the two elements for
     (a₁, a₂).
     """
-    dx, x = xi[1] - xi[0], 1 + xi[0]
-    e1, turn1, e2, turn2 = rotation(x * v1), rotation(dx * v1), rotation(x * v2), rotation(dx * v2)
-    c1 = c2 = f1 = f2 = m0 = m1 = m2 = s0 = s2 = 0.0
-    for t in range(y.size):
-        q1, q2, p = e1.conjugate() * y[t], e2.conjugate() * y[t], e1.conjugate() * e2
-        w = g[t]
-        c1 += w * q1.real
-        c2 += w * q2.real
-        m0 += w * p.real
-        s0 += w
-        w *= 1 + xi[t]
-        f1 += w * q1.imag
-        f2 += w * q2.imag
-        m1 += w * p.imag
-        w *= 1 + xi[t]
-        m2 += w * p.real
-        s2 += w
-        e1 *= turn1
-        e2 *= turn2
+    last = folded.shape[0] - 1
+    s0, s2 = folded[last, 1], folded[last, 2]
+    c1, c2, f1, f2, m0, m1, m2 = sums(folded, v1, v2)
     inverse = 1 / max(s0 * s0 - m0 * m0, _REGULAR * s0 * s0)
     a1 = inverse * (s0 * c1 - m0 * c2)
     a2 = inverse * (s0 * c2 - m0 * c1)
@@ -172,7 +152,7 @@ def _refine_float(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float, limit: 
 
 
 @compiled  # pragma: no cover
-def _refine_fixed(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float, tolerance: float) -> Any:
+def _refine_fixed(folded: Reals, v1: float, v2: float, tolerance: float) -> Any:
     """Levenberg-Marquardt on `_fixed_fit`.
 
     Returns whether a step gained less than ``tolerance``, v₁, v₂, a₁, a₂, the power and the information there.
@@ -181,7 +161,7 @@ def _refine_fixed(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float, toleran
     power, converged = -1.0, False
     t1, t2 = v1, v2
     for _ in range(_STEPS):
-        b1, b2, gained, n_own, n_mutual, e1, e2, n_own_a, n_mutual_a = _fixed_fit(y, g, xi, t1, t2)
+        b1, b2, gained, n_own, n_mutual, e1, e2, n_own_a, n_mutual_a = _fixed_fit(folded, t1, t2)
         if gained >= power:
             converged = gained - power < tolerance
             v1, v2, a1, a2, power, d1, d2 = t1, t2, b1, b2, gained, e1, e2
@@ -201,44 +181,37 @@ def _refine_fixed(y: Phasors, g: Reals, xi: Reals, v1: float, v2: float, toleran
 
 
 @compiled  # pragma: no cover
-def _strongest(y: Phasors, g: Reals, xi: Reals, low: float, high: float, step: float) -> Any:
-    """Of v = low, low + step, … < high the one where y holds most of one path, and the path's complex amplitude."""
-    dx = xi[1] - xi[0]
-    place, residue, most, s0 = low, 0j, -1.0, 0.0
-    for t in range(y.size):
-        s0 += g[t]
+def _strongest(folded: Reals, low: float, high: float, step: float) -> Any:
+    """Of v = low, low + step, … < high the one where the data hold most of one path, and its complex amplitude."""
+    last = folded.shape[0] - 1
+    place, residue, most = low, 0j, -1.0
     for k in range(int((high - low) / step) + 1):
-        v = low + k * step
-        e, turn = rotation(-xi[0] * v), rotation(-dx * v)
-        c = 0j
-        for t in range(y.size):
-            c += g[t] * (e * y[t])
-            e *= turn
+        c = turned_sum(folded, low + k * step)
         power = c.real**2 + c.imag**2
         if power > most:
-            place, residue, most = v, 1 / s0 * c, power
-    return place, residue
+            place, residue, most = low + k * step, c, power
+    return place, 1 / folded[last, 1] * (rotation((1 - folded[last, 3]) * place) * residue)
 
 
 @compiled  # pragma: no cover
 def _nearest(v: float, r: complex) -> float:
     """The coordinate nearest to v whose phase is that of the residue r."""
-    off = math.atan2(r.imag, r.real) - v
-    return v + off - 2 * math.pi * round(off / (2 * math.pi))
+    off = angle_of(r) - v
+    return v + off - 2 * math.pi * math.floor(off * (0.5 / math.pi) + 0.5)
 
 
 @compiled  # pragma: no cover
 def _try_orders(
-    y: Phasors, g: Reals, xi: Reals, total: float, variance: float, solution: Any, turn: float, low: float, high: float,
+    folded: Reals, count: int, total: float, variance: float, solution: Any, turn: float, low: float, high: float,
     seeds: Reals, kept: Reals,
 ) -> None:  # fmt: skip
     """Fix the fringe orders of a float solution and improve the list ``kept`` (CANDIDATES, FIELDS)."""
     v1, v2, r1, r2, power, i11, i12, i22 = solution
     cycle = 2 * math.pi
-    phase1, phase2 = math.atan2(r1.imag, r1.real), math.atan2(r2.imag, r2.real)
+    phase1, phase2 = angle_of(r1), angle_of(r2)
     n1, n2 = (v1 - phase1) / cycle, (v2 - phase2) / cycle
     # Where even the float solution misfits, the noise is not what limits it.
-    scale = variance * max(1.0, (total - power) / (variance * (2 * y.size - 6)))
+    scale = variance * max(1.0, (total - power) / (variance * (2 * count - 6)))
     determinant = max(i11 * i22 - i12 * i12, _REGULAR * i11 * i22)
     reach = min(_ORDER_CHI2 * scale / cycle**2, _ORDER_PAIRS / math.pi * math.sqrt(determinant))
     for j in range(_REFINED):
@@ -269,9 +242,9 @@ def _try_orders(
             t1, t2 = phase1 + cycle * k1, phase2 + cycle * k2
             if abs(t1 - t2) < _CLOSEST_RAD:
                 continue
-            r1, r2 = _residues(y, g, xi, t1, t2)
+            r1, r2 = _residues(folded, t1, t2)
             t1, t2 = _nearest(t1, r1), _nearest(t2, r2)
-            a1, a2, gained, own, mutual, d1, d2, _, _ = _fixed_fit(y, g, xi, t1, t2)
+            a1, a2, gained, own, mutual, d1, d2, _, _ = _fixed_fit(folded, t1, t2)
             if gained < 0:
                 continue
             # What one Gauss-Newton step, of at most one radian, promises to gain.
@@ -294,7 +267,7 @@ def _try_orders(
         if not seeds[j, 0] < math.inf:
             break
         converged, t1, t2, a1, a2, power, own, mutual, own_a, mutual_a = _refine_fixed(
-            y, g, xi, seeds[j, 1], seeds[j, 2], _CONVERGED_CHI2 * variance
+            folded, seeds[j, 1], seeds[j, 2], _CONVERGED_CHI2 * variance
         )
         if turn > 0:
             t1 -= turn * math.floor((t1 - low) / turn)
@@ -336,16 +309,34 @@ def _keep(
     kept[place, 4], kept[place, 5], kept[place, 6] = a2, var_v, var_a
 
 
+def workspace(count: int) -> Workspace:
+    """Arrays that `separate_block` works in, of ``count`` frequencies; one set a thread."""
+    m = count // 2 + 1
+    return (
+        np.empty(count, np.complex128),
+        np.empty(count, np.complex128),
+        np.empty((count // 2 + 2, COLUMNS)),
+        np.empty((count // 2 + 2, COLUMNS)),
+        np.empty((m, m)),
+        np.empty((m, m)),
+        np.empty((4, m)),
+        np.empty((_REFINED, 3)),
+        np.empty((CANDIDATES, FIELDS)),
+    )
+
+
 @compiled  # pragma: no cover
 def separate_block(
     z: NDArray[np.complex64], sigma: Reals, gain: Reals, g: Reals, xi: Reals, unitary: Phasors, k1: Reals, k2: Reals,
     carrier: float, step_rad: float, turn: float, low: float, high: float, found: Floats, start: int, stop: int,
+    work: Workspace,
 ) -> None:  # fmt: skip
-    """Candidates of the pixels start..stop, written into ``found`` (CANDIDATES, 9, P) as `scanner.paths.separation`."""
-    count, m = z.shape[0], k1.shape[1]
-    y, left = np.empty(count, np.complex128), np.empty(count, np.complex128)
-    covariance, square, basis = np.empty((m, m)), np.empty((m, m)), np.empty((4, m))
-    seeds, kept = np.empty((_REFINED, 3)), np.empty((CANDIDATES, FIELDS))
+    """Candidates of the pixels start..stop, written into ``found`` (CANDIDATES, 9, P) as `scanner.paths.separation`.
+
+    ``work`` is `workspace`.
+    """
+    y, left, folded, folded_left, covariance, square, basis, seeds, kept = work
+    count = z.shape[0]
     dof = 2 * count - 4
     # 1/Δf and the width of a path in the spectrum of the comb, 1/(TΔf), as phases of the carrier.
     period = 2 * math.pi / step_rad
@@ -353,10 +344,10 @@ def separate_block(
     middle = 0.5 * (low + high)
     for p in range(start, stop):
         variance = sigma[p] ** 2
-        total = 0.0
         for t in range(count):
             y[t] = (1 / gain[t]) * z[t, p]
-            total += g[t] * (y[t].real ** 2 + y[t].imag ** 2)
+        fold(y, gain, 1.0, 1 + xi[0], xi[1] - xi[0], folded)
+        total = folded[count // 2 + 1, 0]
         if not (0 < total < math.inf and 0 < variance < math.inf):
             continue
         for k in range(CANDIDATES):
@@ -375,12 +366,13 @@ def separate_block(
                     v1, v2, most = centre - apart, centre + apart, power
         for attempt in range(2):
             if attempt == 1:
-                v1, r = _strongest(y, g, xi, low, high, resolution / 8)
+                v1, r = _strongest(folded, low, high, resolution / 8)
                 for t in range(count):
                     left[t] = y[t] - r * rotation(xi[t] * v1)
-                v2, _ = _strongest(left, g, xi, low, high, resolution / 8)
+                fold(left, gain, 1.0, 1 + xi[0], xi[1] - xi[0], folded_left)
+                v2, _ = _strongest(folded_left, low, high, resolution / 8)
             solution = _refine_float(y, g, xi, v1, v2, 0.1 * resolution)
-            _try_orders(y, g, xi, total, variance, solution, turn, low, high, seeds, kept)
+            _try_orders(folded, count, total, variance, solution, turn, low, high, seeds, kept)
             chi2 = kept[0, 0] / variance - 2 * math.log(kept[0, 3] + kept[0, 4])
             if chi2 < dof + 5 * math.sqrt(2 * dof):
                 break

@@ -90,7 +90,9 @@ def _likelihood(
     sigma = np.hypot(paths.sigma[axis, asked], step).astype(np.float64)
     off = (paths.direct[axis, asked] - predicted) / sigma
     normal = -0.5 * off**2 - np.log(math.sqrt(2 * math.pi) * sigma)
-    return np.asarray(np.logaddexp(math.log(1 - _STRAY) + normal, math.log(_STRAY / _SPAN_PX)))
+    # NaN where no neighbour predicts anything.
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.logaddexp(math.log(1 - _STRAY) + normal, math.log(_STRAY / _SPAN_PX)))
 
 
 def _choose(where: NDArray[np.bool_], one: PathPair, other: PathPair) -> PathPair:

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scanner.paths.comb import prepare
-from scanner.paths.kernels import CANDIDATES, Floats, separate_block
+from scanner.paths.kernels import CANDIDATES, Floats, separate_block, workspace
 
 _BLOCK = 2048
 """Pixels that a thread works on at a time."""
@@ -123,7 +123,7 @@ def separate_candidates(
     def separate(start: int) -> None:
         separate_block(
             phasors, sigma, comb.gain, comb.weight, comb.xi, *comb.pencil, comb.carrier, comb.step_rad, comb.turn,
-            comb.low, comb.high, found, start, min(start + _BLOCK, pixels),
+            comb.low, comb.high, found, start, min(start + _BLOCK, pixels), workspace(len(comb.gain)),
         )  # fmt: skip
 
     with ThreadPoolExecutor(CORES) as pool:

@@ -24,6 +24,7 @@ _FLAGS: tuple[tuple[Flag, str, str], ...] = (
     (Flag.SEPARATED, "#3a80c9", "from the two-path separation of round one"),
     (Flag.DEPTH_EDGE, "#7d5fb8", "mixes two surfaces at a depth edge"),
     (Flag.STRAY, "#b0568f", "refused: hardly any neighbour goes on with it"),
+    (Flag.BLIND, "#6b2f6b", "refused: at a fold, where bounces come from too near to be seen"),
     (Flag.OUT_OF_VOLUME, "#8d6e46", "refused: outside the projector picture, or not in front of the rig"),
     (Flag.OFF_EPIPOLAR, "#d3a21a", "refused: (x, y) does not lie on the pixel's epipolar line"),
     (Flag.MISFIT, "#e25a2c", "refused: the fringes do not fit one path"),

@@ -18,7 +18,7 @@ from scanner.paths import Coupling, separate_jointly, separate_two_paths
 pytestmark = pytest.mark.bench
 
 COUPLING = Coupling(line_px=0.05, log_ratio=float(np.log(0.97)), ratio=0.02)
-BANDS = ((20, 60), (60, 142), (142, 640))
+BANDS = ((6, 20), (20, 60), (60, 142), (142, 640))
 
 
 def interval(hits):
@@ -54,6 +54,8 @@ def test_a_hundred_thousand_pixels_on_both_axes(sigma, capsys):
             for low, high in ((0.05, 0.4), (0.4, 0.8), (0.8, 1.2), (1.2, 1.5)):
                 some = (s.alpha >= low) & (s.alpha < high)
                 print(f"  α = {low:g}–{high:g}: direct path {interval(right[some])}")
-        assert right.mean() > 0.945
+        # Within a fringe of each other, in the noise of 10 DN, the paths are told apart in 93 of 100 pixels.
+        assert right.mean() > (0.945 if near >= 20 else 0.92)
         # 2 s on two cores; by CPU, because another program on the machine is not the separation's fault.
-        assert cpu / 2 < (2.0 if (sigma, near) != (10, 20) else 3.5)
+        # Within a fringe and in 10 DN of noise it takes 1.8 s where the machine is quiet, too near to 2 s to be asked.
+        assert cpu / 2 < (2.0 if (sigma, near) != (10, 6) else 2.3)

@@ -121,3 +121,7 @@ def test_between_close_paths_others_meet_unseen():
     assert mask[52:88, 122:138].all()
     # Farther than 32 px apart nothing is said of what lies between.
     assert not mask[:, :110].any()
+    # Paths of this fold at 130 px are mirror images of each other: half of the way ends there.
+    half = between_paths(x, y, 260 - x, y, (300, 200), 32, 0.5)
+    assert half[52:88, 116:129].all()
+    assert not half[:, 132:].any()

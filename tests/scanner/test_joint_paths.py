@@ -21,7 +21,7 @@ from scanner.paths import (
     measure_coupling,
     separate_jointly,
 )
-from scanner.paths.rotation import rotation
+from scanner.paths.rotation import angle_of, rotation
 from scanner.paths.twin import refine_jointly_twin
 from scanner.rig import Rig
 from scanner.triangulation import epipolar_crossings
@@ -76,6 +76,13 @@ def test_direct_path_where_noise_is_large_and_the_paths_are_close():
 def test_points_of_the_unit_circle():
     angles = np.concatenate([np.random.default_rng(82).uniform(-1e5, 1e5, 2000), np.arange(-16, 17) * np.pi / 8])
     assert max(abs(rotation(a) - np.exp(1j * a)) for a in angles) < 1e-10
+
+
+def test_angles_of_complex_numbers():
+    angles = np.concatenate([np.random.default_rng(83).uniform(-np.pi, np.pi, 2000), np.arange(-3, 5) * np.pi / 4])
+    scales = np.logspace(-6, 6, angles.size)
+    assert max(abs(angle_of(complex(z)) - a) for z, a in zip(scales * np.exp(1j * angles), angles, strict=True)) < 3e-8
+    assert angle_of(0j) == 0
 
 
 def test_larger_bounce_is_not_taken_for_direct_light():
@@ -177,6 +184,27 @@ def test_different_numbers_of_frequencies():
     found = separate_jointly(s.rig, s.pixels, {"x": s.axes["x"], "y": fewer}, COUPLING)
     assert found.dof == 2 * 16 - 8 + 3
     assert (np.abs(found.best.direct - s.u[0]) < 0.2).all(axis=0).mean() > 0.98
+
+
+def test_even_number_of_frequencies_and_a_trend_of_their_modulation():
+    s = signals(np.random.default_rng(87), 1000, (0.3, 0.6), 2, (142, 600), (100, 400))
+    trend = np.linspace(1, 0.5, 8)
+    axes = {}
+    for a, v in s.axes.items():
+        k = "xy".index(a)
+        clean = np.sum(s.amplitude[:, k] * np.exp(2j * np.pi * FREQUENCY[:8, None, None] * s.u[:, k]), axis=1)
+        # The noise stays as it is where the fringes are weaker.
+        z = trend[:, None] * clean + (v.z[:8] - clean)
+        axes[a] = AxisPhasorsOf(z.astype(np.complex64), FREQUENCY[:8], v.sigma_z, v.extent, trend)
+    found = separate_jointly(s.rig, s.pixels, axes, COUPLING)
+    assert found.dof == 2 * 16 - 8 + 3
+    clear = decided(found)
+    assert clear.mean() > 0.95
+    z = ((found.best.direct - s.u[0]) / found.best.sigma)[:, clear]
+    assert (np.abs(z) < 3).mean() >= 0.99
+    # The signals keep to the line and to the ratios more closely than the three priors ask; 3 standard errors.
+    slack = 3 * np.sqrt(2 * found.dof / clear.sum())
+    assert found.dof - 3 - slack < found.best.chi2[clear].mean() < found.dof + slack
 
 
 def test_no_pixels():

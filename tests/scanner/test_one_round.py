@@ -88,6 +88,7 @@ def region_of(count=400, **changes):
         "third": no,
         "off_line": no,
         "located": yes,
+        "strength": 0.5 * np.ones(count, np.float32),
         "blur": np.ones(count, np.float32),
     }
     return Separated(**{**values, **changes})

@@ -217,6 +217,8 @@ def test_where_a_bounce_is_too_weak_to_be_detected_it_is_gone_as_well(scan_simul
     window = truth.in_window("W2")
     assert not maps.interreflection[window].all()
     assert np.isfinite(maps.depth[window]).mean() >= 0.98
+    # No fold between shiny faces: nothing is refused for being too near to one.
+    assert ((maps.flags & np.uint16(Flag.BLIND)) > 0).sum() <= 0.001 * np.isfinite(truth.x_p).sum()
     # Between the 16 and 84 % points: a few pixels beside the ball's limb, lit with it, keep an error of their own.
     spread, twin = (
         np.subtract(*np.nanquantile((m.depth - truth.depth)[window], (0.84, 0.16))) for m in (maps, without)

@@ -40,13 +40,16 @@ def test_an_axis_on_which_the_bounce_stands_still_has_a_sigma_that_covers_it(sti
     whole = np.ones(rows.shape, bool)
     off = np.abs(decoded["y"].coordinates.u - u["y"])
     assert (off < 3 * decoded["y"].coordinates.sigma).mean() < 0.5
-    found, changed = without_ripples(frames, decoded, whole, whole, SimpleNamespace(scan=ScanSection()))
+    found, changed, told = without_ripples(frames, decoded, whole, whole, SimpleNamespace(scan=ScanSection()))
     assert changed.mean() > 0.95
+    # The shift, α · 16 px/2π at most, is several σ along x.
+    assert told.mean() > 0.95
     for a in ("x", "y"):
         now = found[a].coordinates
         assert (np.abs(now.u - u[a]) < 3 * now.sigma).mean() > 0.99
-    kept, changed = without_ripples(
+    kept, changed, told = without_ripples(
         frames, decoded, whole, whole, SimpleNamespace(scan=ScanSection(remove_ripples=False))
     )
     assert kept is decoded
     assert not changed.any()
+    assert not told.any()
