@@ -6,6 +6,9 @@ READY  := $(VENV)/.ready
 KERNELS := $(VENV)/.kernels
 BENCH  := $(VENV)/.bench-ready
 
+# The kernels are compiled while style and types are looked at.
+MAKEFLAGS += --jobs=2
+
 .PHONY: demo virtual-bench test lint bench soak clean help
 
 help:            ## this list
