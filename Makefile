@@ -6,6 +6,9 @@ READY  := $(VENV)/.ready
 KERNELS := $(VENV)/.kernels
 BENCH  := $(VENV)/.bench-ready
 
+# The kernels are compiled while style and types are looked at.
+MAKEFLAGS += --jobs=2
+
 .PHONY: demo virtual-bench test lint bench soak clean help
 
 help:            ## this list
@@ -32,9 +35,13 @@ demo: $(KERNELS)   ## scan the mirror scene on the simulated bench and compare M
 virtual-bench: $(KERNELS)  ## the same scan through the real drivers: window, GenICam camera and trigger box, emulated below
 	$(BIN)/scan --config configs/virtual_bench.yaml --out virtual-bench-result --overwrite
 
+# Each worker has a core: threads for all of them would wait for one another. What Python compiles, it keeps.
+SIDE_BY_SIDE = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1 \
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
+
 test: lint $(KERNELS)       ## lint, types, arrows and every test
-	$(BIN)/python -m pytest -m 'not bench and not alone' -n logical --maxprocesses 4 --dist loadfile
-	$(BIN)/python -m pytest -m 'alone and not bench'
+	$(SIDE_BY_SIDE) -n logical --maxprocesses 4 -m 'not bench and not timed'
+	$(SIDE_BY_SIDE) -n 2 -m 'timed and not bench'
 
 lint: $(READY)   ## style, types, and who may import whom
 	$(BIN)/ruff check .

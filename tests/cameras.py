@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import psutil
+from leftovers import shared_memory
 from requirements import require
 
 from drivers import HardwareError, MissingLibraryError, SystemClock
@@ -139,8 +140,7 @@ def left_behind():
         for child in psutil.Process().children(recursive=True)
         if child.is_running() and child.status() != psutil.STATUS_ZOMBIE and "resource_tracker" not in _line(child)
     ]
-    memory = sorted(Path("/dev/shm").glob("psm_*")) if Path("/dev/shm").exists() else []
-    return children, memory
+    return children, {name for name in shared_memory() if name.startswith("psm_")}
 
 
 def _line(process):

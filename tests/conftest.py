@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.ndimage import map_coordinates, spline_filter
+from splines import coefficients, looked_up
 
 from drivers import FrameFormat, FrameStamp, NoiseModel
 
@@ -24,19 +24,31 @@ def pytest_addoption(parser):
 
 
 HERE = Path(__file__).parent
-ALONE = (
+TIMED = (
     "conformance", "drivers/test_doctor", "drivers/test_genicam_faults", "drivers/test_genicam_traps",
     "drivers/test_process", "drivers/test_trigger_box", "drivers/test_window", "scanner/test_cli_interrupted",
     "scanner/test_preview", "sim_backend/gentl", "sim_backend/test_trigger_box", "sim_backend/test_world",
     "sim_backend/test_xserver", "test_virtual",
 )  # fmt: skip
-"""Where tests live on real time, windows or processes of their own: they have the machine to themselves."""
+"""Where tests live on real time, windows or processes of their own: they have the machine to themselves, two by two."""
+
+LONGEST = (
+    "test_numbers", "test_calibration_numbers", "calibration/test_wizard", "scanner/test_ripples",
+    "scanner/test_acquisition", "real/test_slstudio_calibration", "calibration/test_detection",
+    "scanner/test_folds", "sim_backend/test_scenes", "scanner/test_cli", "scanner/test_regional",
+    "calibration/test_person",
+    "test_virtual_faults", "test_virtual_bench", "scanner/test_cli_interrupted", "drivers/test_window_faults",
+)  # fmt: skip
+"""What takes longest begins first, so that no worker is left with it when the others have nothing to do any more."""
 
 
 def pytest_collection_modifyitems(items):
-    for item in items:
-        if item.path.is_relative_to(HERE) and item.path.relative_to(HERE).as_posix().startswith(ALONE):
-            item.add_marker(pytest.mark.alone)
+    places = {item: item.path.relative_to(HERE).as_posix() for item in items if item.path.is_relative_to(HERE)}
+    for item, place in places.items():
+        if place.startswith(TIMED):
+            item.add_marker(pytest.mark.timed)
+    turns = {f"{name}.py": turn for turn, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: turns.get(places.get(item, ""), len(turns)))
 
 
 def pytest_configure(config):
@@ -93,6 +105,7 @@ class ArrayBench:
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng(self.seed)
         self._pictures: list[np.ndarray] = []
+        self._looked_up: list[tuple[np.ndarray, np.ndarray, Any]] = []
 
     @property
     def projector_size(self) -> tuple[int, int]:
@@ -110,13 +123,20 @@ class ArrayBench:
         self._pictures = [p.astype(np.float32) for p in patterns]
 
     def light(self, picture: np.ndarray) -> np.ndarray:
-        spline = spline_filter(picture, order=3, mode="nearest")
+        spline = coefficients(picture).ravel()
 
         def at(x, y):
-            return map_coordinates(spline, [y, x], order=3, mode="nearest", prefilter=False)
+            return (self._weights(x, y, picture.shape) @ spline).reshape(x.shape)
 
         bounce = self.alpha * at(self.x_bounce, self.y_bounce) if self.alpha.any() else 0.0
         return self.ambient + self.gain * (at(self.x, self.y) + bounce)
+
+    def _weights(self, x, y, shape):
+        for known_x, known_y, weights in self._looked_up:
+            if np.array_equal(known_x, x) and np.array_equal(known_y, y):
+                return weights
+        self._looked_up.append((x.copy(), y.copy(), looked_up(x, y, shape)))
+        return self._looked_up[-1][2]
 
     def expose(self, index, out) -> FrameStamp:
         number, self.exposures, self.dark = self.exposures, self.exposures + 1, False

@@ -27,7 +27,7 @@ bench:
   scene: {name: plane}
   camera: {width_px: 288, height_px: 216, exposure_us: 16667}
   projector: {width_px: 320, height_px: 200, gamma: 1.6}
-  transport: {supersample: 2, photons: 1000}
+  transport: {supersample: 1, photons: 1000}
 scan: {method: tps, axes: [x, y], steps: 5}
 output: {ply: false, report: false}
 calibration:

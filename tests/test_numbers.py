@@ -1,7 +1,8 @@
 """The figures that the project promises, on simulated scenes, against the scenes' own truth.
 
 No parameter of the product was chosen on the scenes of this file: angles, tilts, roughness, poses and seeds are drawn
-here. The figures are those of a camera of 1024 × 768, a projector of 1280 × 800 and σ = 1.5 DN.
+here. The figures are those of a camera of 1024 × 768 (plane and steps: 512 × 384), a projector of 1280 × 800 and
+σ = 1.5 DN.
 """
 
 from __future__ import annotations
@@ -120,7 +121,9 @@ def test_plane_fit_beside_the_other_methods_and_the_scene_without_mirror(scan_si
         ("MPS, F + 2", scene, "mps_gn"),
         ("MFS without mirror", without, "mfs"),
     ):
-        result = maps if method is None else scan_simulated(chosen, method, seed=32, camera=camera)[0]
+        # The other methods need one axis to be wrong by whole fringes; what is compared with needs both, as MFS.
+        options = {"axes": ["x", "y"] if method == "mfs" else ["x"]}
+        result = maps if method is None else scan_simulated(chosen, method, options, seed=32, camera=camera)[0]
         known = region & np.isfinite(result.points[..., 2])
         normal, d = fit_plane(result.points[known])
         rows[name] = ((result.points[known] @ normal - d).std(), known.sum() / region.sum())
@@ -134,16 +137,17 @@ def test_plane_fit_beside_the_other_methods_and_the_scene_without_mirror(scan_si
 
 
 @pytest.mark.parametrize(
-    "scene",
+    ("scene", "width_px"),
     [
-        {"name": "plane", "yaw_deg": 17.0, "pitch_deg": -9.0},
-        {"name": "sphere"},
-        {"name": "steps", "yaw_deg": 4.0},
+        ({"name": "plane", "yaw_deg": 17.0, "pitch_deg": -9.0}, 512),
+        ({"name": "sphere"}, 1024),  # curved within wider pixels, whose mean is not the surface at their centres
+        ({"name": "steps", "yaw_deg": 4.0}, 512),
     ],
-    ids=lambda s: s["name"],
+    ids=["plane", "sphere", "steps"],
 )
-def test_shapes_within_their_predicted_error(scan_simulated, scene):
-    maps, truth = scan_simulated(scene, seed=7, options={"steps": 4})
+def test_shapes_within_their_predicted_error(scan_simulated, scene, width_px):
+    camera = {"width_px": width_px, "height_px": width_px * 3 // 4}
+    maps, truth = scan_simulated(scene, seed=7, options={"steps": 4}, camera=camera)
     known = np.isfinite(maps.points[..., 2]) & np.isfinite(truth.depth)
     error = np.linalg.norm(maps.points - truth.points, axis=-1)[known]
     sigma = maps.sigma_point[known]

@@ -5,13 +5,14 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
+from leftovers import shared_memory
 from virtual import SMALL, all_photographed, photographed, require_virtual_bench, sequence, small
+from windows import within
 
 from drivers import HardwareError
 from drivers.examination import Verdict
@@ -176,7 +177,7 @@ def nothing_left(tmp_path, monkeypatch):
     def variables():
         return {name for name in os.environ if name.startswith("MFS_SIM_")}
 
-    before = processes(), variables(), set(os.listdir("/dev/shm"))
+    before = processes(), variables(), shared_memory()
     with tempfile.TemporaryDirectory(prefix="vb-") as folder:
         monkeypatch.setattr(tempfile, "tempdir", folder)
         monkeypatch.setenv("TMPDIR", folder)
@@ -185,10 +186,7 @@ def nothing_left(tmp_path, monkeypatch):
         assert not alive
         assert not os.listdir(folder)
     assert variables() == before[1]
-    deadline = time.monotonic() + 30  # other programs on this machine come and go
-    while set(os.listdir("/dev/shm")) - before[2] and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert set(os.listdir("/dev/shm")) <= before[2]
+    assert within(30.0, lambda: shared_memory() <= before[2])
 
 
 def line(process):
@@ -232,7 +230,6 @@ def kill_and_go_on(bench, pid, pattern):
 
 
 _PROGRAM = """
-import time
 from sim_backend.virtual_bench import kind
 from sim_backend.virtual_settings import VirtualSettings
 

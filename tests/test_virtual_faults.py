@@ -21,6 +21,7 @@ import numpy as np
 import psutil
 import pytest
 from desktop import Desktop
+from leftovers import shared_memory
 from requirements import require
 from windows import within
 
@@ -145,11 +146,6 @@ def leftovers():
             if "resource_tracker" not in " ".join([process.name(), *process.cmdline()]).replace("-", "_"):
                 found.add(process.pid)
     return found
-
-
-def shared_memory():
-    """Names of shared memory; semaphores are none of the drivers', and other programs' come and go."""
-    return {name for name in os.listdir("/dev/shm") if not name.startswith("sem.")}
 
 
 @pytest.fixture(scope="class")

@@ -8,6 +8,8 @@ of pixels, whatever bounces do to the waveform.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,23 +57,21 @@ def formed_excess(
             continue
         steady = STEADY**2 * float(np.square(b[there]).mean()) / (2 * waveform.sigma_dn**2)
         bright = float(np.square(level[there]).mean())
-        values, vectors = np.linalg.eigh(_products(harmonics[there]))
+        alike = _scaled(harmonics[there])
+        values, vectors = np.linalg.eigh(alike.T @ alike)
         clear = values > _ALIKE * values[-1]
-        spoilt = _scaled(harmonics[there]) @ (vectors[:, clear] / np.sqrt(values[clear]))
+        spoilt = alike @ (vectors[:, clear] / np.sqrt(values[clear]))
+        own = _Forms.of(forms[there], spoilt)
         for n in np.flatnonzero(waveform.visible >= _LEAST_VISIBLE):
-            own = forms[there]
+            mine = own
             if n == 0 and former is not None:
-                own = np.column_stack([own, former[waveform.usable][there]])
-            own = _scaled(own)
-            free = own - spoilt @ (spoilt.T @ own)
-            values, vectors = np.linalg.eigh(free.T @ free)
-            clear = values > _ALIKE
-            if not clear.any():
+                mine = _Forms.of(np.column_stack([forms[there], former[waveform.usable][there]]), spoilt)
+            if not mine.energy.size:
                 continue
-            along = vectors[:, clear].T @ (free.T @ waveform.errors[n, there])
-            error = own @ (vectors[:, clear] @ (along / values[clear]))
-            energy = float((along**2 / values[clear]).sum()) * waveform.visible[n] / waveform.sigma_dn**2
-            certain = energy / highest_by_chance(_BY_CHANCE, int(clear.sum()), waveform.noise)
+            along = mine.axes.T @ waveform.errors[n, there]
+            error = mine.shown @ (along / mine.energy)
+            energy = float((along**2 / mine.energy).sum()) * waveform.visible[n] / waveform.sigma_dn**2
+            certain = energy / highest_by_chance(_BY_CHANCE, mine.energy.size, waveform.noise)
             # A phase moves by (2/N) (e/B) sin(φ + δ), its noise is √(2/N) σ/B.
             moved = 2 / count * float(np.square(error * np.sin(phase[there] + steps_rad[n])).mean())
             harm = moved / waveform.sigma_dn**2 / (HARMFUL + steady)
@@ -83,11 +83,34 @@ def formed_excess(
     return np.concatenate([by_tile, found[:, -1:]], axis=1)
 
 
+@dataclass(frozen=True)
+class _Forms:
+    """Forms that an error can have at P pixels, in combinations that what spoils a frame leaves apart.
+
+    Parameters
+    ----------
+    axes
+        (P, k) the combinations without what spoils a frame, at right angles to one another.
+    shown
+        (P, k) the same with it, as they are in a frame.
+    energy
+        (k,) that of ``axes``.
+    """
+
+    axes: NDArray[np.float64]
+    shown: NDArray[np.float64]
+    energy: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, columns: NDArray[np.float64], spoilt: NDArray[np.float64]) -> _Forms:
+        """Of forms (P, n); ``spoilt`` (P, m) are of unit length and at right angles."""
+        own = _scaled(columns)
+        free = own - spoilt @ (spoilt.T @ own)
+        values, vectors = np.linalg.eigh(free.T @ free)
+        clear = values > _ALIKE
+        return cls(free @ vectors[:, clear], own @ vectors[:, clear], values[clear])
+
+
 def _scaled(columns: NDArray[np.float64]) -> NDArray[np.float64]:
     """The columns, each with unit length."""
-    return np.asarray(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-9))
-
-
-def _products(columns: NDArray[np.float64]) -> NDArray[np.float64]:
-    scaled = _scaled(columns)
-    return np.asarray(scaled.T @ scaled)
+    return np.asarray(columns / np.maximum(np.sqrt(np.einsum("ij,ij->j", columns, columns)), 1e-9))

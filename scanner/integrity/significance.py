@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -67,9 +69,14 @@ def highest_by_chance(probability: float, degrees: int, noise: Noise) -> float:
 
     A quantile of χ²; of F where the noise is measured as well.
     """
+    return _highest_by_chance(probability, degrees, noise.freedom)
+
+
+@lru_cache(maxsize=64)  # asked for every frame in every tile of a sequence
+def _highest_by_chance(probability: float, degrees: int, freedom: float) -> float:
     # Heavy, and not needed where the steps are few.
     from scipy.stats import chi2, f
 
-    if not np.isfinite(noise.freedom):
+    if not np.isfinite(freedom):
         return float(chi2.isf(probability, degrees))
-    return float(degrees * f.isf(probability, degrees, noise.freedom))
+    return float(degrees * f.isf(probability, degrees, freedom))

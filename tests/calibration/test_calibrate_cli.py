@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 from small_bench import calibrate
 
 from calibration.folder import CalibrationFolder
+from drivers import SteppedBench
+from sim_backend import stage
 
 BENCH_WITHOUT = "bench: {kind: simulated, scene: {name: plane}}\n"
 
@@ -91,10 +95,16 @@ def test_folders_in_use_and_of_others_are_refused(bench_file, tmp_path):
     refused(calibrate(*common, "--out", tmp_path / "photos"), "something else", "--out")
 
 
-def test_bench_before_which_nobody_holds_anything_says_so(bench_file, tmp_path, monkeypatch):
-    from sim_backend.stage import SimulatedBench
+@dataclass
+class Unattended(SteppedBench):
+    """The simulated bench without a way to present anything."""
 
-    monkeypatch.delattr(SimulatedBench, "present")
+    settings: Any = field(kw_only=True)
+    transports: Any = field(kw_only=True)
+
+
+def test_bench_before_which_nobody_holds_anything_says_so(bench_file, tmp_path, monkeypatch):
+    monkeypatch.setattr(stage, "SimulatedBench", Unattended)
     ran = calibrate("--config", bench_file, "--headless", "--out", tmp_path / "out")
     refused(ran, "has nobody who holds things before it", "without --headless")
 
