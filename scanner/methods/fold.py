@@ -51,11 +51,20 @@ class Fold:
         (height, width) bool, their projector places: nothing can be measured there, and they throw bounces.
     beside
         (height, width) bool, places less than two fringes from those: two paths are too few there.
+    across
+        (H, W) bool, detected pixels whose bounces are strong and near, as most around them are: from across a fold.
     """
 
     blind: NDArray[np.bool_]
     strip: NDArray[np.bool_]
     beside: NDArray[np.bool_]
+    across: NDArray[np.bool_]
+
+    @classmethod
+    def none(cls, shape: tuple[int, ...], size: tuple[int, int]) -> Fold:
+        """No fold, for a camera's (height, width) and a projector's (width, height)."""
+        camera, projector = np.zeros(shape, bool), np.zeros((size[1], size[0]), bool)
+        return cls(camera, projector, projector, camera)
 
 
 def find_folds(
@@ -77,9 +86,8 @@ def find_folds(
     size
         Projector (width, height), px.
     """
-    nothing = np.zeros((size[1], size[0]), bool)
     if x is None or y is None:
-        return Fold(np.zeros(separated.shape, bool), nothing, nothing)
+        return Fold.none(separated.shape, size)
     paths = [p[a] for p in (separated.u, separated.bounce) for a in AXES]
     away = np.hypot(paths[2] - paths[0], paths[3] - paths[1])
     near = separated.plausible & (separated.strength >= _STRONG) & (away <= _DETECTED_PX)
@@ -90,13 +98,16 @@ def find_folds(
         places = between_paths(direct_x, direct_y, from_x, from_y, size, _DETECTED_PX, 0.5)
         return np.asarray(undetected & inside(places, x, y, 0))
 
-    blind, sure = between(near), between(near & _mostly(near, separated, detection, step))
+    mostly = near & _mostly(near, separated, detection, step)
+    blind, sure = between(near), between(mostly)
     count, labels = cv2.connectedComponents(blind.astype(np.uint8), connectivity=8)
     area = np.bincount(labels.ravel(), minlength=count)
     share = np.bincount(labels[sure & blind], minlength=count) / np.maximum(area, 1)
     blind &= ((share >= _SURE) & (area >= LEAST_SURFACE))[labels]
     strip, beside = (emitter_mask(x[blind], y[blind], size, reach, step) for reach in (_BLUR_PX, CLOSE_PATHS_PX))
-    return Fold(blind | (undetected & inside(strip, x, y, 0)), strip, beside)
+    across = np.zeros(separated.shape, bool)
+    across.reshape(-1)[separated.pixels[mostly]] = True
+    return Fold(blind | (undetected & inside(strip, x, y, 0)), strip, beside, across)
 
 
 def _mostly(near: NDArray[np.bool_], separated: Separated, detection: Detection, step: float) -> NDArray[np.bool_]:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from scanner.methods.fold import CLOSE_PATHS_PX
+from scanner.methods.fold import CLOSE_PATHS_PX, Fold
 from scanner.methods.separated import Separated
 from scanner.patterns import AXES
 from scanner.regions import (
@@ -35,6 +35,7 @@ def lit_sets(
     rim: NDArray[np.bool_],
     first: tuple[NDArray[np.float32], NDArray[np.float32]],
     separated: Separated,
+    fold: Fold,
     size: tuple[int, int],
     margin_px: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int8], list[NDArray[np.bool_]]]:
@@ -52,8 +53,8 @@ def lit_sets(
         (H, W) bool, pixels of the region without a group, and undetected ones around, that are served as well.
     first
         Coordinates (x, y) of round one, (H, W) px.
-    separated
-        Round one's separation.
+    separated, fold
+        Round one's separation, and what lies at folds.
     size, margin_px
         Projector (width, height), px; by how much what is lit is grown.
 
@@ -82,10 +83,12 @@ def lit_sets(
             found = np.where(np.isnan(found), doubted[mine], found)
             place[mine] = found
             direct.append(np.append(u[chosen], found))
-        ends = paths[0][chosen], paths[1][chosen], paths[2][chosen], paths[3][chosen]
         # The margin grows neither onto emitters nor across a fold.
-        across = beyond_the_middle(*ends, CLOSE_PATHS_PX)
-        emitters = np.append(ends[2], across[0]), np.append(ends[3], across[1])
+        across = chosen & fold.across
+        beyond = beyond_the_middle(
+            paths[0][across], paths[1][across], paths[2][across], paths[3][across], CLOSE_PATHS_PX
+        )
+        emitters = np.append(paths[2][chosen], beyond[0]), np.append(paths[3][chosen], beyond[1])
         mask = sound_mask(direct[0], direct[1], size, margin_px, emitters, step)
         around = rim & (nearest == k)
         along = sound_mask(first[0][around], first[1][around], size, margin_px, None, step)

@@ -58,8 +58,8 @@ class Regional:
         (H, W) uint8, the sequence that is meant to measure the pixel, 0 for none.
     served
         (H, W) bool, undetected pixels whose coordinates the sequences may replace.
-    strip
-        (height, width) bool, what stays dark: places that nothing can measure and that still throw bounces.
+    fold
+        What lies at folds: its strip stays dark.
     most
         Sequences at most.
     taken
@@ -83,7 +83,7 @@ class Regional:
     y: NDArray[np.float32]
     own: NDArray[np.uint8]
     served: NDArray[np.bool_]
-    strip: NDArray[np.bool_]
+    fold: Fold
     most: int
     taken: int
     lit: NDArray[np.uint8]
@@ -104,7 +104,7 @@ class Regional:
             y=unknown,
             own=np.zeros(shape, np.uint8),
             served=no,
-            strip=np.zeros((size[1], size[0]), bool),
+            fold=Fold.none(shape, size),
             most=0,
             taken=0,
             lit=np.zeros((size[1], size[0]), np.uint8),
@@ -169,12 +169,12 @@ def begin(
     if group.max() < 1 and both:
         group = np.where(plausible(separated) & lit_together(*paths), np.int8(0), np.int8(-1))
     between = detection.region & (group < 0)
-    x, y, group, masks = lit_sets(group, paths, located, between, rim, (one_x, one_y), separated, size, margin_px)
+    x, y, group, masks = lit_sets(group, paths, located, between, rim, (one_x, one_y), separated, fold, size, margin_px)
     masks = [mask & ~fold.strip for mask in masks]
     return replace(
         Regional.nothing(shape, size),
         queue=tuple(masks) if masks and masks[0].any() else (),
-        strip=fold.strip,
+        fold=fold,
         x=x,
         y=y,
         own=(group + 1).astype(np.uint8),
@@ -217,9 +217,9 @@ def again(
     nothing = np.zeros_like(rest)
     between, located = rest & (group < 0), np.isfinite(paths[2])
     x, y, group, masks = lit_sets(
-        group, paths, located, between, nothing, (paths[0], paths[1]), separated, size, margin_px
+        group, paths, located, between, nothing, (paths[0], paths[1]), separated, regional.fold, size, margin_px
     )
-    masks = [mask & ~regional.strip for mask in masks]
+    masks = [mask & ~regional.fold.strip for mask in masks]
     new = np.isfinite(x)
     return replace(
         regional,
