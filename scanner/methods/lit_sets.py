@@ -11,10 +11,10 @@ from scanner.methods.fold import CLOSE_PATHS_PX, Fold
 from scanner.methods.separated import Separated
 from scanner.patterns import AXES
 from scanner.regions import (
+    LEAST_SURFACE,
     beyond_the_middle,
     continued,
     emitter_mask,
-    on_surface,
     pitch,
     sound_mask,
     surfaces,
@@ -72,14 +72,13 @@ def lit_sets(
     nearest = _around(group, [np.where(np.isfinite(p), p, u) for p, u in zip(places, first, strict=True)])
     step = pitch(paths[0], paths[1])
     masks = []
-    doubtful = _direct_anyhow(separated)
     for k in range(int(group.max()) + 1):
         chosen, mine = group == k, between & (nearest == k)
         direct = []
-        for place, u, doubted, a in zip(places, paths[:2], doubtful, AXES, strict=True):
+        for place, u, doubted, a in zip(places, paths[:2], _goes_on(separated, paths, chosen), AXES, strict=True):
             # Where the fringe orders of both paths could not be told, the surface around them can.
             found = continued(u, chosen, mine) if a in separated.u else u[mine]
-            # Farther from it, many pixels that agree: a third path spoils a bounce sooner than the direct path.
+            # Farther away, what is on one surface with it: a third path spoils a bounce sooner than the direct path.
             found = np.where(np.isnan(found), doubted[mine], found)
             place[mine] = found
             direct.append(np.append(u[chosen], found))
@@ -97,12 +96,18 @@ def lit_sets(
     return places[0], places[1], np.where(np.isfinite(places[0]) | np.isfinite(places[1]), nearest, -1), masks
 
 
-def _direct_anyhow(separated: Separated) -> NDArray[np.float32]:
-    """(2, H, W) direct coordinates of all separated pixels, fitting or not, where they continue each other, px."""
+def _goes_on(separated: Separated, paths: NDArray[np.float32], chosen: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """(2, H, W) direct coordinates of separations that do not fit, px, where they go on with those of a group."""
     found = np.full((2, *separated.shape), np.nan, np.float32)
-    if len(separated.u) == 2:
-        found.reshape(2, -1)[:, separated.pixels] = [separated.u[a] for a in AXES]
-        found[:, ~on_surface(found[0], found[1])] = np.nan
+    if len(separated.u) < 2:
+        return found
+    spoilt = ~separated.plausible
+    found.reshape(2, -1)[:, separated.pixels[spoilt]] = [separated.u[a][spoilt] for a in AXES]
+    found[:, chosen] = paths[:2, chosen]
+    count, labels, _ = surfaces(found[0], found[1])
+    connected = np.bincount(labels[chosen], minlength=count) >= LEAST_SURFACE
+    connected[0] = False
+    found[:, ~connected[labels]] = np.nan
     return found
 
 

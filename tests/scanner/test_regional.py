@@ -233,29 +233,33 @@ def test_where_a_bounce_is_too_weak_to_be_detected_it_is_gone_as_well(scan_simul
     assert np.nanmedian(alone) > 2 * np.nanmedian(np.abs(maps.x_p - truth.x_p)[window])
 
 
+def separation(x, y, bounce_x, fits):
+    """Round one's separation of whole pictures: clear where it fits, a third path elsewhere."""
+    fits = fits.ravel()
+    return Separated(
+        shape=x.shape,
+        pixels=np.arange(x.size),
+        u={"x": x.ravel(), "y": y.ravel()},
+        sigma={"x": np.full(x.size, 0.01, np.float32), "y": np.full(x.size, 0.01, np.float32)},
+        bounce={"x": bounce_x.ravel(), "y": y.ravel()},
+        plausible=fits,
+        trusted=fits,
+        third=~fits,
+        off_line=np.zeros(x.size, bool),
+        located=fits,
+        strength=np.full(x.size, 0.5, np.float32),
+        blur=np.ones(x.size, np.float32),
+    )
+
+
 def test_far_from_a_clear_separation_coordinates_that_agree_say_where_to_light():
     # A square where a third path spoils the fit of two: its direct coordinates hold, its bounces do not.
     rows, columns = np.mgrid[:200, :200].astype(np.float32)
     x, y = 100 + columns, 50 + rows
     spoilt = (np.abs(rows - 100) < 80) & (np.abs(columns - 100) < 80)
-    count = x.size
-    yes, clear = np.ones(count, bool), ~spoilt.ravel()
     random = np.random.default_rng(3)
     bounce = np.where(spoilt, random.uniform(300, 600, x.shape), x + 350).astype(np.float32)
-    separated = Separated(
-        shape=x.shape,
-        pixels=np.arange(count),
-        u={"x": x.ravel(), "y": y.ravel()},
-        sigma={"x": np.full(count, 0.01, np.float32), "y": np.full(count, 0.01, np.float32)},
-        bounce={"x": bounce.ravel(), "y": y.ravel()},
-        plausible=clear,
-        trusted=clear,
-        third=~clear,
-        off_line=~yes,
-        located=clear,
-        strength=np.full(count, 0.5, np.float32),
-        blur=np.ones(count, np.float32),
-    )
+    separated = separation(x, y, bounce, ~spoilt)
     no = np.zeros(x.shape, bool)
     detection = SimpleNamespace(region=~no, penumbra=no, depth_edge=no)
     first = SimpleNamespace(x_p_round1=x, y_p_round1=y, valid=no)
@@ -268,3 +272,21 @@ def test_far_from_a_clear_separation_coordinates_that_agree_say_where_to_light()
     begun = begin(astray, detection, Fold.none(no.shape, (700, 300)), first, (700, 300), 8.0, 4)
     assert not begun.queue[0][:, 310:].any()
     assert not begun.queue[0][130:170, 180:220].any()
+
+
+def test_a_surface_that_lights_the_chosen_one_stays_dark_whether_its_separations_fit_or_not():
+    # Left and right light each other; only one sequence is allowed, and the larger one, on the left, is lit.
+    rows, columns = np.mgrid[:120, :200].astype(np.float32)
+    left = columns < 120
+    x, y = np.where(left, 100 + columns, 380 + columns).astype(np.float32), 50 + rows
+    bounce = np.where(left, 500 + 80 / 120 * columns, 100 + (columns - 120) * 1.5).astype(np.float32)
+    spoilt = ~left & (rows > 60)
+    no = np.zeros(x.shape, bool)
+    detection = SimpleNamespace(region=~no, penumbra=no, depth_edge=no)
+    first = SimpleNamespace(x_p_round1=x, y_p_round1=y, valid=no)
+    begun = begin(
+        separation(x, y, bounce, ~spoilt), detection, Fold.none(no.shape, (700, 300)), first, (700, 300), 8.0, 1
+    )
+    assert len(begun.queue) == 1
+    assert begun.queue[0][60:160, 110:210].all()
+    assert not begun.queue[0][:, 480:].any()
