@@ -35,6 +35,9 @@ _MOST = 0.5
 _SURE = 0.25
 """Share of a blind strip that lies between such bounces."""
 
+_SPOILT = 0.02
+"""Share of pixels beside folds that fit no two paths, from which the others are doubted: of good ones 1 in 1e4 does."""
+
 _BLUR_PX = 2.0
 """The strip's light reaches so far beyond it, by the projector's blur."""
 
@@ -50,7 +53,7 @@ class Fold:
     strip
         (height, width) bool, their projector places: nothing can be measured there, and they throw bounces.
     beside
-        (height, width) bool, places less than two fringes from those: two paths are too few there.
+        (height, width) bool, places less than two fringes from those: two paths may be too few there.
     across
         (H, W) bool, detected pixels whose bounces are strong and near, as most around them are: from across a fold.
     """
@@ -121,8 +124,14 @@ def _mostly(near: NDArray[np.bool_], separated: Separated, detection: Detection,
 
 
 def doubted_beside(fold: Fold, separated: Separated) -> Separated:
-    """Trust no separation beside a fold: it says where to light, and is no coordinate."""
+    """Trust no separation beside folds where two paths are too few: it says where to light, and is no coordinate.
+
+    Faces that light each other send light back and forth, and then some pixels beside the fold fit no two paths; beside
+    a mirror, which sends light one way only, all do.
+    """
     if not fold.blind.any():
         return separated
     near = inside(fold.beside, separated.u["x"], separated.u["y"], 0)
+    if np.count_nonzero(near & ~separated.plausible) < _SPOILT * np.count_nonzero(near):
+        return separated
     return replace(separated, trusted=separated.trusted & ~near)
