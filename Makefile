@@ -6,9 +6,6 @@ READY  := $(VENV)/.ready
 KERNELS := $(VENV)/.kernels
 BENCH  := $(VENV)/.bench-ready
 
-# The kernels are compiled while style and types are looked at.
-MAKEFLAGS += --jobs=2
-
 .PHONY: demo virtual-bench test lint bench soak clean help
 
 help:            ## this list
@@ -39,7 +36,9 @@ virtual-bench: $(KERNELS)  ## the same scan through the real drivers: window, Ge
 SIDE_BY_SIDE = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1 \
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 
-test: lint $(KERNELS)       ## lint, types, arrows and every test
+# The kernels are compiled while style and types are looked at.
+test: $(READY)   ## lint, types, arrows and every test
+	@$(MAKE) --no-print-directory --jobs=2 lint $(KERNELS)
 	$(SIDE_BY_SIDE) -n logical --maxprocesses 4 -m 'not bench and not timed'
 	$(SIDE_BY_SIDE) -n 2 -m 'timed and not bench'
 
