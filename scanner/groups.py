@@ -1,10 +1,11 @@
 """Groups of places that do not light each other: each gets a regional sequence of its own (method.md §5).
 
 Round one's separated paths say of every pixel which projector place lights it directly and which one its bounce comes
-from: a graph "place A lights place B" over cells of the projector's picture. Its cells are coloured so that few bounces
-have both ends in one group, and neighbours rarely part. A group that lights itself is cut in two by the mean field of
-that energy, annealed (Peterson & Anderson, Complex Systems 1, 995 (1987)); partners lie on opposite ends of their
-bounces, so that the main direction of the bounces says where to begin.
+from: a graph "place A lights place B" over cells of the projector's picture. Where the faces of the scene are known
+(`scanner.faces`) each is a group to begin with, and those that do not light each other are joined. A group that still
+lights itself is cut in two so that few bounces have both ends in one part, and neighbours rarely part, by the mean
+field of that energy, annealed (Peterson & Anderson, Complex Systems 1, 995 (1987)); partners lie on opposite ends of
+their bounces, so that the main direction of the bounces says where to begin.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ from scanner.regions import CELL_PX, HARM, LEAST_SURFACE
 
 _COHERENCE = 0.25
 """What parting two neighbouring cells costs, in pixels of a cell: those that the end of the lit set cuts."""
+
+_HOLLOW = 0.5
+"""Share of a face's bounces that come from the face itself."""
 
 _LEAST_GROUP = 0.01
 """Share of the pixels below which a group is not worth a sequence."""
@@ -41,9 +45,10 @@ class _Graph:
     """Cells of the region: pixels in each, who lights whom, and who lies beside whom.
 
     ``lights[i, j]`` counts the pixels of cell i whose bounce comes from cell j; ``beside`` is symmetric; ``towards`` is
-    the (n, 2) mean way from a cell to its sources, px.
+    the (n, 2) mean way from a cell to its sources, px. A place that two faces share at a crease is a cell of each.
     """
 
+    face: NDArray[np.intp]
     pixels: NDArray[np.float64]
     lights: csr_array
     beside: csr_array
@@ -61,6 +66,7 @@ def group_places(
     bounce_x: NDArray[np.float32],
     bounce_y: NDArray[np.float32],
     most: int,
+    face: NDArray[np.int32] | None = None,
 ) -> NDArray[np.int8]:
     """Divide pixels into the fewest groups in which hardly any bounce starts where a member is lit.
 
@@ -72,6 +78,8 @@ def group_places(
         (P,) where their bounces come from; NaN where unknown or where there is none.
     most
         Groups at most.
+    face
+        (P,) number of the face that a pixel sees, 0 where none is known; None where faces are not known at all.
 
     Returns
     -------
@@ -79,14 +87,14 @@ def group_places(
         (P,) number of the group, the largest first; -1 without a coordinate, and in groups too small for a sequence.
     """
     group = np.full(x.shape, -1, np.int8)
-    cell, graph = _graph(x, y, bounce_x, bounce_y)
+    cell, graph = _graph(x, y, bounce_x, bounce_y, np.zeros(x.shape, np.int32) if face is None else face)
     if not graph.pixels.size:
         return group
-    label = np.zeros(graph.pixels.size, np.intp)
     allowed = HARM * max(float(np.isfinite(bounce_x).sum()), 1.0)
-    whole: set[int] = set()
+    label = _merged(graph, _by_size(graph, graph.face), allowed, most)
+    whole = np.zeros(label.size, bool)
     while (count := int(label.max()) + 1) < most:
-        conflicts = [0.0 if k in whole else graph.conflicts(label == k) for k in range(count)]
+        conflicts = [0.0 if whole[label == k].any() else _to_part(graph, label == k) for k in range(count)]
         worst = int(np.argmax(conflicts))
         if conflicts[worst] <= allowed / count:
             break
@@ -94,56 +102,85 @@ def group_places(
         side = _cut(graph, members)
         kept = graph.conflicts(members & side) + graph.conflicts(members & ~side)
         if kept > (1 - _LEAST_GAIN) * conflicts[worst]:
-            whole.add(worst)
+            whole |= members
             continue
         label[members & side] = count
-        label = _merged(graph, label, allowed)
+        label = _merged(graph, label, allowed, most)
+    label = _by_size(graph, label)
     sizes = np.bincount(label, graph.pixels)
-    order = np.argsort(-sizes, kind="stable")
-    rank = np.empty_like(order)
-    rank[order] = np.arange(order.size)
-    rank[sizes < max(_LEAST_GROUP * sizes.sum(), LEAST_SURFACE)] = -1
+    label[(sizes < max(_LEAST_GROUP * sizes.sum(), LEAST_SURFACE))[label]] = -1
     known = cell >= 0
-    group[known] = rank[label[cell[known]]]
+    group[known] = label[cell[known]]
     return group
 
 
+def _to_part(graph: _Graph, members: NDArray[np.bool_]) -> float:
+    """Conflicts of a group that are worth a cut; of known faces only where most of their bounces are their own.
+
+    A face lights itself where it is hollow; else a bounce with a wrong fringe order says so now and then.
+    """
+    conflicts = graph.conflicts(members)
+    arriving = float(members.astype(float) @ graph.lights.sum(axis=1))
+    return 0.0 if graph.face[members].all() and conflicts <= _HOLLOW * arriving else conflicts
+
+
+def _by_size(graph: _Graph, label: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Labels of the cells numbered anew without gaps, that of the most pixels first."""
+    label = np.unique(label, return_inverse=True)[1]
+    order = np.argsort(-np.bincount(label, graph.pixels), kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(order.size)
+    return np.asarray(rank[label])
+
+
 def _graph(
-    x: NDArray[np.float32], y: NDArray[np.float32], bounce_x: NDArray[np.float32], bounce_y: NDArray[np.float32]
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    bounce_x: NDArray[np.float32],
+    bounce_y: NDArray[np.float32],
+    face: NDArray[np.int32],
 ) -> tuple[NDArray[np.intp], _Graph]:
     """Cell of every pixel, -1 for none, and the graph of the cells."""
     known = np.isfinite(x) & np.isfinite(y)
     row, column = (np.floor(np.where(known, u, 0) / CELL_PX).astype(np.intp) for u in (y, x))
     height, width = (int(v[known].max(initial=0)) + 2 for v in (row, column))
     known &= (row >= 0) & (column >= 0)
-    flat = np.where(known, row * width + column, 0)
-    counts = np.bincount(flat[known], minlength=height * width)
-    number = np.full(height * width, -1)
+    layers = int(face.max(initial=0)) + 1
+    flat = np.where(known, (face * height + row) * width + column, 0)
+    counts = np.bincount(flat[known], minlength=layers * height * width)
+    number = np.full(counts.size, -1)
     number[counts >= _SEEN] = np.arange(np.count_nonzero(counts >= _SEEN))
     cell = np.where(known, number[flat], -1)
     n = int(number.max()) + 1
+    grid, seen = number.reshape(layers, height, width), counts.reshape(layers, height, width)
     # Who lights whom: only sources within the region count, and none that no mask could leave dark.
     lit = (cell >= 0) & np.isfinite(bounce_x) & np.isfinite(bounce_y)
     away = np.stack([bounce_x - x, bounce_y - y], axis=1).astype(np.float64)
     lit &= np.nan_to_num(np.hypot(away[:, 0], away[:, 1])) > _TOO_CLOSE_PX
     from_row, from_column = (np.floor(np.where(lit, u, -1) / CELL_PX).astype(np.intp) for u in (bounce_y, bounce_x))
     lit &= (from_row >= 0) & (from_row < height) & (from_column >= 0) & (from_column < width)
-    source = np.where(lit, number[np.where(lit, from_row * width + from_column, 0)], -1)
+    there = np.where(lit, from_row, 0), np.where(lit, from_column, 0)
+    # Where faces share a place, another than the pixel's own throws the bounce.
+    most = np.argsort(-seen, axis=0, kind="stable")
+    own = most[0][there] == face
+    from_face = np.where(own & (layers > 1), most[min(1, layers - 1)][there], most[0][there])
+    from_face = np.where(grid[from_face, *there] >= 0, from_face, most[0][there])
+    source = np.where(lit, grid[from_face, *there], -1)
     lit &= source >= 0
     pairs = (cell[lit], source[lit])
     lights = csr_array((np.ones(pairs[0].size), pairs), shape=(n, n))
     emitting = np.maximum(np.bincount(pairs[0], minlength=n), 1)
     towards = np.stack([np.bincount(pairs[0], away[lit, k], n) / emitting for k in (0, 1)], axis=1)
     # Who lies beside whom.
-    grid = number.reshape(height, width)
-    ones = [(grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:])]
+    ones = [(grid[:, :, :-1], grid[:, :, 1:]), (grid[:, :-1], grid[:, 1:])]
     first, second = (np.concatenate([pair[k].ravel() for pair in ones]) for k in (0, 1))
     both = (first >= 0) & (second >= 0)
     first, second = first[both], second[both]
     pixels = counts[counts >= _SEEN].astype(np.float64)
     weight = np.minimum(pixels[first], pixels[second])
     beside = csr_array((weight, (first, second)), shape=(n, n))
-    return cell, _Graph(pixels, lights, csr_array(beside + beside.T), towards)
+    layer = np.flatnonzero(counts >= _SEEN) // (height * width)
+    return cell, _Graph(layer, pixels, lights, csr_array(beside + beside.T), towards)
 
 
 def _cut(graph: _Graph, members: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -164,15 +201,21 @@ def _cut(graph: _Graph, members: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return cut
 
 
-def _merged(graph: _Graph, label: NDArray[np.intp], allowed: float) -> NDArray[np.intp]:
-    """Join groups that can be lit together after all; numbers without gaps."""
+def _merged(graph: _Graph, label: NDArray[np.intp], allowed: float, most: int) -> NDArray[np.intp]:
+    """Join groups that can be lit together after all, and those that suffer least where there are too many."""
     count = int(label.max()) + 1
-    for a in range(count):
-        for b in range(a + 1, count):
-            first, second = label == a, label == b
-            if not first.any() or not second.any():
-                continue
-            together = graph.conflicts(first | second) - graph.conflicts(first) - graph.conflicts(second)
-            if together <= HARM * allowed:
-                label = np.where(second, a, label)
-    return np.unique(label, return_inverse=True)[1]
+    one = csr_array((np.ones(label.size), (np.arange(label.size), label)), shape=(label.size, count))
+    between = (one.T @ (graph.lights @ one)).toarray()
+    between += between.T
+    np.fill_diagonal(between, np.inf)
+    into = np.arange(count)
+    while count > 1:
+        a, b = sorted(np.unravel_index(np.argmin(between), between.shape))
+        if between[a, b] > HARM * allowed and count <= most:
+            break
+        into[into == b] = a
+        between[a] += between[b]
+        between[:, a] += between[:, b]
+        between[b] = between[:, b] = between[a, a] = np.inf
+        count -= 1
+    return np.unique(into[label], return_inverse=True)[1]

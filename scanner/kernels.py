@@ -411,7 +411,7 @@ def unwrap_twin(
 def compile_all() -> float:
     """Compile every kernel of the package, for 8- and 16-bit frames, into the cache; returns the seconds it took."""
     began = time.perf_counter()
-    from scanner import cloud, paths, pooling, ripples, strays, triangulation
+    from scanner import cloud, faces, paths, pooling, ripples, strays, triangulation
 
     few = np.ones((9, 4), np.complex64)
     paths.separate_two_paths(few, np.array([(80 + t) / 1280 for t in range(9)]), np.ones(4, np.float32), 1280)
@@ -426,6 +426,7 @@ def compile_all() -> float:
     unwrap(z, np.array([1 / 16, 1 / 17, 1 / 18]), np.ones(3), np.ones(8, np.float32), -0.5, 63.5)
     pooling.compile_all()
     ripples.compile_all()
+    faces.compile_all()
     strays.strays(np.ones((3, 3), np.float32), None)
     return time.perf_counter() - began
 

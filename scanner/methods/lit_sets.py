@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from scanner.faces import Faces
 from scanner.methods.fold import CLOSE_PATHS_PX, Fold
 from scanner.methods.separated import Separated
 from scanner.patterns import AXES
@@ -23,6 +24,9 @@ from scanner.regions import (
 _AROUND_PX = 24.0
 """Standard deviation of the window in which what round one does not tell follows most of what it does, camera px."""
 
+_BEYOND = np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5)), np.uint8)
+"""Two pixels beyond the end of a face."""
+
 _EMITTER_PX = 3.0
 """How far from an emitter undetected places are lit along."""
 
@@ -36,6 +40,7 @@ def lit_sets(
     first: tuple[NDArray[np.float32], NDArray[np.float32]],
     separated: Separated,
     fold: Fold,
+    faces: Faces | None,
     size: tuple[int, int],
     margin_px: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int8], list[NDArray[np.bool_]]]:
@@ -53,8 +58,8 @@ def lit_sets(
         (H, W) bool, pixels of the region without a group, and undetected ones around, that are served as well.
     first
         Coordinates (x, y) of round one, (H, W) px.
-    separated, fold
-        Round one's separation, and what lies at folds.
+    separated, fold, faces
+        Round one's separation, what lies at folds, and the faces of the scene where they are known.
     size, margin_px
         Projector (width, height), px; by how much what is lit is grown.
 
@@ -69,7 +74,7 @@ def lit_sets(
         place[rim] = u[rim]
     if group.max(initial=-1) < 0:
         return places[0], places[1], group, []
-    nearest = _around(group, [np.where(np.isfinite(p), p, u) for p, u in zip(places, first, strict=True)])
+    nearest = _around(group, faces, [np.where(np.isfinite(p), p, u) for p, u in zip(places, first, strict=True)])
     step = pitch(paths[0], paths[1])
     masks = []
     for k in range(int(group.max()) + 1):
@@ -84,15 +89,23 @@ def lit_sets(
             direct.append(np.append(u[chosen], found))
         # The margin grows neither onto emitters nor across a fold.
         across = chosen & fold.across
-        beyond = beyond_the_middle(
+        behind = beyond_the_middle(
             paths[0][across], paths[1][across], paths[2][across], paths[3][across], CLOSE_PATHS_PX
         )
-        emitters = np.append(paths[2][chosen], beyond[0]), np.append(paths[3][chosen], beyond[1])
+        emitters = np.append(paths[2][chosen], behind[0]), np.append(paths[3][chosen], behind[1])
         mask = sound_mask(direct[0], direct[1], size, margin_px, emitters, step)
-        around = rim & (nearest == k)
+        around = rim & (nearest == k) & ~chosen
         along = sound_mask(first[0][around], first[1][around], size, margin_px, None, step)
         sources = paths[2][chosen & located], paths[3][chosen & located]
-        masks.append(mask | (along & ~emitter_mask(*sources, size, _EMITTER_PX, step)))
+        throwing = emitter_mask(*sources, size, _EMITTER_PX, step)
+        mask |= along & ~throwing
+        dark = fold.strip
+        if faces is not None:
+            others = faces.others(np.unique(faces.label[chosen]), size)
+            # Fringes are whole up to the end of a face only where a little more is lit, and that may throw no bounce.
+            beyond = cv2.erode(others.astype(np.uint8), _BEYOND, borderValue=1) > 0
+            dark = dark | beyond | (others & throwing)
+        masks.append(mask & ~dark)
     return places[0], places[1], np.where(np.isfinite(places[0]) | np.isfinite(places[1]), nearest, -1), masks
 
 
@@ -111,9 +124,13 @@ def _goes_on(separated: Separated, paths: NDArray[np.float32], chosen: NDArray[n
     return found
 
 
-def _around(group: NDArray[np.int8], places: list[NDArray[np.float32]]) -> NDArray[np.int8]:
+def _around(group: NDArray[np.int8], faces: Faces | None, places: list[NDArray[np.float32]]) -> NDArray[np.int8]:
     """(H, W) group of every pixel: its own, else that of most pixels around it, on the same surface if there is any."""
     count, labels, _ = surfaces(places[0], places[1])
+    if faces is not None:
+        # A bit of continuous surface may belong to two faces, and a face is in one group.
+        labels = np.where(faces.label > 0, faces.label + count, labels)
+        count += int(faces.label.max()) + 1
     votes = []
     for k in range(int(group.max()) + 1):
         mine = group == k

@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
+from scanner.faces import Faces
 from scanner.groups import group_places
 from scanner.interreflection import Detection
 from scanner.methods.base import FirstRound
@@ -60,6 +62,8 @@ class Regional:
         (H, W) bool, undetected pixels whose coordinates the sequences may replace.
     fold
         What lies at folds: its strip stays dark.
+    faces
+        Faces of the scene; None where they are not known.
     most
         Sequences at most.
     taken
@@ -84,6 +88,7 @@ class Regional:
     own: NDArray[np.uint8]
     served: NDArray[np.bool_]
     fold: Fold
+    faces: Faces | None
     most: int
     taken: int
     lit: NDArray[np.uint8]
@@ -105,6 +110,7 @@ class Regional:
             own=np.zeros(shape, np.uint8),
             served=no,
             fold=Fold.none(shape, size),
+            faces=None,
             most=0,
             taken=0,
             lit=np.zeros((size[1], size[0]), np.uint8),
@@ -126,6 +132,7 @@ def begin(
     separated: Separated,
     detection: Detection,
     fold: Fold,
+    faces: Faces | None,
     first: Maps,
     size: tuple[int, int],
     margin_px: float,
@@ -139,6 +146,8 @@ def begin(
         Round one: both paths in its region, and the coordinates outside.
     fold
         What lies at folds: its strip stays dark.
+    faces
+        Faces of the scene, which are lit one after the other; None where they are not known.
     size
         Projector (width, height), px.
     margin_px
@@ -159,22 +168,27 @@ def begin(
         close = between_paths(x, y, from_x, from_y, size, CLOSE_PATHS_PX)
         rim = rim | (~detection.region & ~detection.depth_edge & inside(close, one_x, one_y, 0))
     rim = rim & first.valid & ~fold.blind
+    if faces is not None:
+        rim = rim | (_beside(detection, one_x, one_y) & first.valid & ~fold.blind & (faces.label > 0))
+        paths = faces.settled(paths)
+        one_x, one_y = (np.where(faces.label > 0, f, u) for f, u in ((faces.x, one_x), (faces.y, one_y)))
     group = np.where(known, np.int8(0), np.int8(-1))
     if both and most > 1:
-        group[known] = -1
-        known = known & on_surface(paths[0], paths[1])
-        x, y = (p[known] for p in paths[:2])
-        from_x, from_y = (np.where(located, p, np.float32(np.nan))[known] for p in paths[2:])
-        group[known] = group_places(x, y, from_x, from_y, most)
+        group = _groups(paths, located, detection.region, rim, faces, most)
     if group.max() < 1 and both:
         group = np.where(plausible(separated) & lit_together(*paths), np.int8(0), np.int8(-1))
+    if faces is not None:
+        # Of a face without a group nothing is lit.
+        rim = rim & ((group >= 0) | (faces.label == 0))
     between = detection.region & (group < 0)
-    x, y, group, masks = lit_sets(group, paths, located, between, rim, (one_x, one_y), separated, fold, size, margin_px)
-    masks = [mask & ~fold.strip for mask in masks]
+    x, y, group, masks = lit_sets(
+        group, paths, located, between, rim, (one_x, one_y), separated, fold, faces, size, margin_px
+    )
     return replace(
         Regional.nothing(shape, size),
         queue=tuple(masks) if masks and masks[0].any() else (),
         fold=fold,
+        faces=faces,
         x=x,
         y=y,
         own=(group + 1).astype(np.uint8),
@@ -207,19 +221,17 @@ def again(
         return regional
     once = np.stack([plane(separated, values.get(a)) for values in (separated.u, separated.bounce) for a in AXES])
     paths = np.where(np.isfinite(regional.failed[:1]), regional.failed, once)
+    if regional.faces is not None:
+        paths = regional.faces.settled(paths)
     paths = np.where(rest, paths, np.float32(np.nan))
-    known = on_surface(paths[0], paths[1])
-    group = np.full(rest.shape, -1, np.int8)
-    x, y, from_x, from_y = (p[known] for p in paths)
-    group[known] = group_places(x, y, from_x, from_y, budget)
+    nothing, located = np.zeros_like(rest), np.isfinite(paths[2])
+    group = _groups(paths, located, rest, nothing, regional.faces, budget)
     if group.max() < 1:
-        group = np.where(known & lit_together(*paths), np.int8(0), np.int8(-1))
-    nothing = np.zeros_like(rest)
-    between, located = rest & (group < 0), np.isfinite(paths[2])
+        group = np.where(on_surface(paths[0], paths[1]) & lit_together(*paths), np.int8(0), np.int8(-1))
+    between, first = rest & (group < 0), (paths[0], paths[1])
     x, y, group, masks = lit_sets(
-        group, paths, located, between, nothing, (paths[0], paths[1]), separated, regional.fold, size, margin_px
+        group, paths, located, between, nothing, first, separated, regional.fold, regional.faces, size, margin_px
     )
-    masks = [mask & ~regional.fold.strip for mask in masks]
     new = np.isfinite(x)
     return replace(
         regional,
@@ -229,6 +241,32 @@ def again(
         own=np.where(group >= 0, group + 1 + regional.taken, regional.own).astype(np.uint8),
         left=left,
     )
+
+
+def _groups(
+    paths: NDArray[np.float32],
+    located: NDArray[np.bool_],
+    region: NDArray[np.bool_],
+    rim: NDArray[np.bool_],
+    faces: Faces | None,
+    most: int,
+) -> NDArray[np.int8]:
+    """(H, W) number of the group of every pixel of the region, and with faces of its rim; -1 for none."""
+    group = np.full(region.shape, -1, np.int8)
+    known = region & on_surface(paths[0], paths[1])
+    if faces is not None:
+        known = (region & (known | (faces.label > 0))) | (rim & (faces.label > 0))
+    x, y = (p[known] for p in paths[:2])
+    from_x, from_y = (np.where(located, p, np.float32(np.nan))[known] for p in paths[2:])
+    group[known] = group_places(x, y, from_x, from_y, most, None if faces is None else faces.label[known])
+    return group
+
+
+def _beside(detection: Detection, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(H, W) bool, undetected pixels less than two fringes from the region: weaker bounces arrive there."""
+    reach = int(np.ceil(CLOSE_PATHS_PX / max(pitch(x, y), 1 / 16)))
+    near = distance_transform_edt(~detection.region) <= reach
+    return np.asarray(near & ~detection.region & ~detection.depth_edge)
 
 
 def remaining(regional: Regional, region: NDArray[np.bool_]) -> NDArray[np.bool_]:

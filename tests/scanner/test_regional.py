@@ -263,13 +263,13 @@ def test_far_from_a_clear_separation_coordinates_that_agree_say_where_to_light()
     no = np.zeros(x.shape, bool)
     detection = SimpleNamespace(region=~no, penumbra=no, depth_edge=no)
     first = SimpleNamespace(x_p_round1=x, y_p_round1=y, valid=no)
-    begun = begin(separated, detection, Fold.none(no.shape, (700, 300)), first, (700, 300), 8.0, 4)
+    begun = begin(separated, detection, Fold.none(no.shape, (700, 300)), None, first, (700, 300), 8.0, 4)
     assert len(begun.queue) == 1
     assert begun.queue[0][50:250, 100:300].all()
     # Coordinates that agree with no neighbour light nothing.
     scattered = np.where(spoilt, random.uniform(300, 600, x.shape), x).astype(np.float32)
     astray = replace(separated, u={"x": scattered.ravel(), "y": y.ravel()})
-    begun = begin(astray, detection, Fold.none(no.shape, (700, 300)), first, (700, 300), 8.0, 4)
+    begun = begin(astray, detection, Fold.none(no.shape, (700, 300)), None, first, (700, 300), 8.0, 4)
     assert not begun.queue[0][:, 310:].any()
     assert not begun.queue[0][130:170, 180:220].any()
 
@@ -285,7 +285,7 @@ def test_a_surface_that_lights_the_chosen_one_stays_dark_whether_its_separations
     detection = SimpleNamespace(region=~no, penumbra=no, depth_edge=no)
     first = SimpleNamespace(x_p_round1=x, y_p_round1=y, valid=no)
     begun = begin(
-        separation(x, y, bounce, ~spoilt), detection, Fold.none(no.shape, (700, 300)), first, (700, 300), 8.0, 1
+        separation(x, y, bounce, ~spoilt), detection, Fold.none(no.shape, (700, 300)), None, first, (700, 300), 8.0, 1
     )
     assert len(begun.queue) == 1
     assert begun.queue[0][60:160, 110:210].all()
