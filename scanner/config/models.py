@@ -242,8 +242,8 @@ class ScanSection(_Section):
         ge=1,
         le=8,
         description="How many regional sequences mfs may take after round one. 1: one, for the largest part; more: "
-        "places that light each other take turns, and what still sees a bounce is lit once more by itself. A mirror "
-        "in the picture counts as a place.",
+        "faces that light each other take turns, and what still sees a bounce is lit once more by itself. A mirror "
+        "in the picture counts as a face.",
     )
     lit_margin_px: float = Field(
         6, ge=0, le=200, description="By how much the region that round two lights is grown, projector px."

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from scanner.faces.seeds import ROUGH
+from scanner.faces.seeds import ROUGH, SHARPEST_DEG
 from scanner.kernels import over_pixels
 
 _REACH = 8
@@ -25,6 +27,8 @@ _HOLE = 48
 _SWEEPS = 48
 """How often the end of two faces is moved, a cell at a time."""
 
+_LEAST_ALONG = float(np.cos(np.radians(SHARPEST_DEG)))
+
 compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 _ALL_AROUND = np.ones((3, 3), np.uint8)
@@ -35,19 +39,32 @@ Ground = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], ND
 them sure, NaN for none; and how far the projector coordinate moves with each, px mm."""
 
 
-def grow(
-    label: NDArray[np.int32],
-    w: NDArray[np.float64],
-    ground: Ground,
-    sharp: NDArray[np.bool_],
-    tolerance_px: float,
-) -> None:
-    """Let faces grow over what continues them, in place.
+@dataclass(frozen=True)
+class Grown:
+    """Faces as far as they have grown; the arrays are changed in place.
 
     Parameters
     ----------
-    label, w
-        (H, W) face of every cell, 0 for none, and its inverse depth there. **Changed.**
+    label
+        (H, W) face of every cell, 0 for none.
+    w
+        (H, W) its inverse depth there.
+    normal
+        (H, W, 3) unit normal where the face began, nearest to the cell.
+    """
+
+    label: NDArray[np.int32]
+    w: NDArray[np.float64]
+    normal: NDArray[np.float64]
+
+
+def grow(grown: Grown, ground: Ground, sharp: NDArray[np.bool_], tolerance_px: float) -> None:
+    """Let faces grow over what continues them.
+
+    Parameters
+    ----------
+    grown
+        **Changed.**
     ground
         What cells offer.
     sharp
@@ -57,54 +74,41 @@ def grow(
     """
     may = np.isfinite(ground[2]).any(axis=0) & ~sharp
     for _ in range(_LAYERS):
-        if not _layer(label, w, ground, may, tolerance_px, False):
+        if not _layer(grown, ground, may, tolerance_px, False):
             break
 
 
-def fill(
-    label: NDArray[np.int32], w: NDArray[np.float64], ground: Ground, wanted: NDArray[np.bool_], tolerance_px: float
-) -> None:
+def fill(grown: Grown, ground: Ground, wanted: NDArray[np.bool_], tolerance_px: float) -> None:
     """Continue faces as planes to what is left of ``wanted``, (H, W) bool: creases and holes. Arguments as `grow`."""
-    filled = np.zeros(label.shape, bool)
+    filled = np.zeros(wanted.shape, bool)
     for _ in range(_HOLE):
-        before = label > 0
-        if not _layer(label, w, ground, wanted, tolerance_px, True):
+        before = grown.label > 0
+        if not _layer(grown, ground, wanted, tolerance_px, True):
             break
-        filled |= (label > 0) & ~before
+        filled |= (grown.label > 0) & ~before
     for _ in range(_SWEEPS):
-        if not _step(label, w, ground, filled & _beside_another(label), tolerance_px, True):
+        if not _step(grown, ground, filled & _beside_another(grown.label), tolerance_px, True):
             break
 
 
-def _layer(
-    label: NDArray[np.int32],
-    w: NDArray[np.float64],
-    ground: Ground,
-    may: NDArray[np.bool_],
-    tolerance_px: float,
-    planes: bool,
-) -> bool:
+def _layer(grown: Grown, ground: Ground, may: NDArray[np.bool_], tolerance_px: float, planes: bool) -> bool:
     """Let all faces grow by a cell; whether any did."""
+    label = grown.label
     front = may & (label == 0) & (cv2.dilate((label > 0).astype(np.uint8), _ALL_AROUND) > 0)
-    return _step(label, w, ground, front, tolerance_px, planes)
+    return _step(grown, ground, front, tolerance_px, planes)
 
 
-def _step(
-    label: NDArray[np.int32],
-    w: NDArray[np.float64],
-    ground: Ground,
-    front: NDArray[np.bool_],
-    tolerance_px: float,
-    planes: bool,
-) -> bool:
+def _step(grown: Grown, ground: Ground, front: NDArray[np.bool_], tolerance_px: float, planes: bool) -> bool:
     """Decide of all cells of a front at once to which face they belong; whether any label changed."""
     cells = np.flatnonzero(front)
     if not cells.size:
         return False
-    chosen, value = np.zeros(cells.size, np.int32), np.zeros(cells.size)
-    over_pixels(lambda a, b: _decide(label, w, *ground, cells, tolerance_px, planes, chosen, value, a, b), cells.size)
-    found = (chosen > 0) & (chosen != label.ravel()[cells])
-    label.ravel()[cells[found]], w.ravel()[cells[found]] = chosen[found], value[found]
+    chosen, value, normal = np.zeros(cells.size, np.int32), np.zeros(cells.size), np.zeros((cells.size, 3))
+    before = grown.label, grown.w, grown.normal, *ground
+    over_pixels(lambda a, b: _decide(*before, cells, tolerance_px, planes, chosen, value, normal, a, b), cells.size)
+    found = (chosen > 0) & (chosen != grown.label.ravel()[cells])
+    grown.label.ravel()[cells[found]], grown.w.ravel()[cells[found]] = chosen[found], value[found]
+    grown.normal.reshape(-1, 3)[cells[found]] = normal[found]
     return bool(found.any())
 
 
@@ -178,10 +182,18 @@ def _plane(label, w, x, y, row, column, face, out):  # type: ignore[no-untyped-d
 
 
 @compiled
+def _turned(plane, x, y, began):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
+    """Whether a plane faces elsewhere than the face did where it began: it would go around a crease."""
+    third = plane[0] - plane[1] * x - plane[2] * y
+    along = plane[1] * began[0] + plane[2] * began[1] + third * began[2]
+    return along < _LEAST_ALONG * np.sqrt(plane[1] ** 2 + plane[2] ** 2 + third**2)
+
+
+@compiled
 def _decide(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    label, w, x, y, offered, scale, cells, tolerance_px, planes, chosen, value, start, stop
+    label, w, began, x, y, offered, scale, cells, tolerance_px, planes, chosen, value, normal, start, stop
 ):
-    """Face of the cells numbered start..stop, and its inverse depth there.
+    """Face of the cells numbered start..stop, its inverse depth there, and the normal where it began.
 
     The face that what is offered misses least; its place is what is offered, or on the face continued as a plane. Where
     nothing is sure, that plane need not be met: of two faces that may be seen the nearer is, for those that light each
@@ -208,6 +220,9 @@ def _decide(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
                 if blind:
                     if plane[0] > best:
                         best, chosen[i], value[i] = plane[0], face, plane[0]
+                        normal[i] = began[r, c]
+                    continue
+                if not planes and _turned(plane, x[row, column], y[row, column], began[r, c]):
                     continue
                 for k in range(1 if planes else offered.shape[0]):
                     off = abs(offered[k, row, column] - plane[0]) * scale[k, row, column]
@@ -216,6 +231,7 @@ def _decide(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
                     if off <= tolerance_px and -off > best and not bent:
                         best, chosen[i] = -off, face
                         value[i] = plane[0] if planes else offered[k, row, column]
+                        normal[i] = began[r, c]
 
 
 @compiled
@@ -249,6 +265,7 @@ def compile_all() -> None:
     offered, scale = np.full((2, 12, 24), 0.01), np.full((2, 12, 24), 1e4)
     offered[0, :, 8:16] = np.nan
     ground = x, y, offered, scale
-    grow(label, w, ground, np.zeros_like(wanted), 1.0)
-    fill(label, w, ground, wanted, 1.0)
+    grown = Grown(label, w, np.tile([0.0, 0.0, 1.0], (12, 24, 1)))
+    grow(grown, ground, np.zeros_like(wanted), 1.0)
+    fill(grown, ground, wanted, 1.0)
     borders(label, w, ground)

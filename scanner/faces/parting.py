@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scanner.faces.growing import Ground, borders, fill, grow
+from scanner.faces.growing import Ground, Grown, borders, fill, grow
 from scanner.faces.seeds import SHARPEST_DEG, seeds
 from scanner.regions import pitch
 from scanner.rig import Rig
@@ -27,7 +27,7 @@ _BEND = 3.0
 _LEAST_BORDER = 8
 """Cells along which two pieces of one face go over into each other at least."""
 
-_WHOLE = 0.5
+_WHOLE = 0.8
 """At this share of the cells between them they do."""
 
 _SAME_PLACE_PX = 4.0
@@ -109,14 +109,14 @@ def find_faces(rig: Rig, sure: Coordinates, open_to: Sequence[Coordinates], want
     offered, scale = (np.stack([p[k] for p in places]) for k in (0, 1))
     ground = x, y, offered, scale
     tolerance = _TOLERANCE_PX + 0.5 * step * side
-    label, sharp = seeds(offered[0], (x, y), scale[0], tolerance)
+    label, normal, sharp = seeds(offered[0], (x, y), scale[0], tolerance)
     if not label.any():
         nothing = np.full(shape, np.nan, np.float32)
         return Faces(np.zeros(shape, np.int32), nothing, nothing)
-    w = np.where(label > 0, offered[0], np.nan)
-    grow(label, w, ground, sharp, tolerance)
-    fill(label, w, ground, wanted[grid] | np.isfinite(offered).any(axis=0), _BEND * tolerance)
-    label = _joined(label, w, ground, tolerance)
+    grown = Grown(label, np.where(label > 0, offered[0], np.nan), normal)
+    grow(grown, ground, sharp, tolerance)
+    fill(grown, ground, wanted[grid] | np.isfinite(offered).any(axis=0), _BEND * tolerance)
+    w, label = grown.w, _joined(label, grown.w, ground, tolerance)
     points = rays / np.where(label > 0, w, np.nan)[..., None]
     pixels = rig.projector.project(rig.to_projector_frame(points))
     label = np.where(np.isfinite(pixels[..., 0]), label, 0)

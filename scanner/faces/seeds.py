@@ -27,8 +27,8 @@ def seeds(
     rays: tuple[NDArray[np.float64], NDArray[np.float64]],
     scale: NDArray[np.float64],
     tolerance_px: float,
-) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """Number of the seed that a cell belongs to, (H, W), 0 for none; and which cells lie at creases and steps.
+) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.bool_]]:
+    """Find where faces begin: numbers of seeds, normals, and cells that lie at creases and steps.
 
     Parameters
     ----------
@@ -40,10 +40,16 @@ def seeds(
         (H, W) how far the projector coordinate moves with w, px mm.
     tolerance_px
         By how much what continues a face may miss it.
+
+    Returns
+    -------
+    tuple
+        (H, W) number of the seed that a cell belongs to, 0 for none; (H, W, 3) unit normals, NaN where too little is
+        known; and (H, W) bool, the cells at creases and steps.
     """
     known = np.isfinite(w)
     if not known.any():
-        return np.zeros(w.shape, np.int32), ~known
+        return np.zeros(w.shape, np.int32), np.full((*w.shape, 3), np.nan), ~known
     normals, rough = _planes(w, known, rays)
     bend = _bend(normals)
     with np.errstate(invalid="ignore"):
@@ -54,7 +60,7 @@ def seeds(
     large = stats[:, cv2.CC_STAT_AREA] >= _LEAST_SEED
     large[0] = False
     number = np.where(large, np.cumsum(large), 0)
-    return np.asarray(number[labels], np.int32), sharp
+    return np.asarray(number[labels], np.int32), normals, sharp
 
 
 def _planes(

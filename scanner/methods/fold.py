@@ -35,8 +35,8 @@ _MOST = 0.5
 _SURE = 0.25
 """Share of a blind strip that lies between such bounces."""
 
-_SPOILT = 0.02
-"""Share of pixels beside folds that fit no two paths, from which the others are doubted: of good ones 1 in 1e4 does."""
+_MUTUAL = 0.05
+"""Share of the bounces beside folds that go the other way where faces light each other; beside a mirror none does."""
 
 _BLUR_PX = 2.0
 """The strip's light reaches so far beyond it, by the projector's blur."""
@@ -126,12 +126,14 @@ def _mostly(near: NDArray[np.bool_], separated: Separated, detection: Detection,
 def doubted_beside(fold: Fold, separated: Separated) -> Separated:
     """Trust no separation beside folds where two paths are too few: it says where to light, and is no coordinate.
 
-    Faces that light each other send light back and forth, and then some pixels beside the fold fit no two paths; beside
-    a mirror, which sends light one way only, all do.
+    Faces that light each other send light back and forth; a mirror sends it one way only.
     """
-    if not fold.blind.any():
+    across = fold.across.reshape(-1)[separated.pixels]
+    if not fold.blind.any() or not across.any():
+        return separated
+    away = np.stack([(separated.bounce[a] - separated.u[a])[across] for a in AXES], axis=1)
+    along = away @ np.linalg.eigh(away.T @ away)[1][:, -1]
+    if not _MUTUAL <= np.mean(along > 0) <= 1 - _MUTUAL:
         return separated
     near = inside(fold.beside, separated.u["x"], separated.u["y"], 0)
-    if np.count_nonzero(near & ~separated.plausible) < _SPOILT * np.count_nonzero(near):
-        return separated
     return replace(separated, trusted=separated.trusted & ~near)

@@ -125,3 +125,59 @@ def test_between_close_paths_others_meet_unseen():
     half = between_paths(x, y, 260 - x, y, (300, 200), 32, 0.5)
     assert half[52:88, 116:129].all()
     assert not half[:, 132:].any()
+
+
+def with_faces(arrows, places, astray=0.0, seed=1):
+    """`scene`, its squares as faces 1, 2, …; a share of all pixels takes another of the face for its source."""
+    coordinates, part = scene(arrows, places, seed)
+    rng = np.random.default_rng(seed)
+    for number in range(len(places)):
+        mine = np.flatnonzero(part == number)
+        wrong = mine[rng.random(mine.size) < astray]
+        other = rng.choice(mine, wrong.size)
+        for k in (0, 1):
+            coordinates[2 + k][wrong] = coordinates[k][other]
+    return coordinates, part
+
+
+def test_a_face_is_not_cut_for_bounces_that_seem_to_come_from_itself():
+    coordinates, part = with_faces((1, 0, None, None), PLACES, astray=0.2)
+    group = group_places(*coordinates, 8, (part + 1).astype(np.int32))
+    assert [len(np.unique(group[part == k])) for k in range(4)] == [1, 1, 1, 1]
+    assert np.median(group[part == 0]) != np.median(group[part == 1])
+    # Without faces the same pixels fall into bits.
+    assert len(np.unique(group_places(*coordinates, 8)[part == 2])) > 1
+
+
+def test_a_hollow_face_is_cut():
+    x, y = square(100, 50, side=200)
+    group = group_places(x, y, 400 - x, y + 3, 8, np.ones(x.shape, np.int32))
+    assert np.median(group[x < 190]) != np.median(group[x > 210])
+
+
+@pytest.mark.parametrize("most", [4, 2])
+def test_faces_that_suffer_least_share_a_sequence(most):
+    # Two light each other, and the third one a little: the first less than the second.
+    places = [(40, 40), (240, 40), (40, 240)]
+    (x, y, bounce_x, bounce_y), part = scene((1, 0, None), places)
+    third = np.flatnonzero(part == 2)
+    for some, right in ((third[:200], 0), (third[200:800], 200)):
+        bounce_x[some], bounce_y[some] = x[some] + right, y[some] - 200
+    group = group_places(x, y, bounce_x, bounce_y, most, (part + 1).astype(np.int32))
+    assert [len(np.unique(group[part == k])) for k in range(3)] == [1, 1, 1]
+    assert len(np.unique(group)) == min(most, 3)
+    assert group[part == 0][0] != group[part == 1][0]
+    if most == 2:
+        assert group[part == 2][0] == group[part == 0][0]
+
+
+def test_at_a_crease_the_other_face_throws_the_bounce():
+    # Both faces of a fold have pixels in the cells along it; the bounces there come from the other one.
+    x, y = square(100, 50, side=200)
+    left = x < 200
+    near = np.abs(x - 200) < 30
+    bounce_x, bounce_y = np.where(near, 400 - x, np.nan), np.where(near, y + 3, np.nan)
+    face = np.where(left, 1, 2).astype(np.int32)
+    group = group_places(x, y, bounce_x.astype(np.float32), bounce_y.astype(np.float32), 8, face)
+    assert group.max() == 1
+    assert len(np.unique(group[left])) == len(np.unique(group[~left])) == 1
