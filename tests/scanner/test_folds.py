@@ -70,6 +70,21 @@ def test_the_strip_stays_dark_so_that_it_throws_no_bounce(groove):
     assert both < 0.1 < one
 
 
+def test_each_face_is_lit_whole_and_without_the_other(groove):
+    maps, truth = groove
+    measured = {face: maps.sequence[truth.places[face] & (maps.sequence > 0)] for face in ("left", "right")}
+    main = {face: np.bincount(s).argmax() for face, s in measured.items()}
+    assert main["left"] != main["right"]
+    for face, sequences in measured.items():
+        assert (sequences == main[face]).mean() >= 0.98
+    # Where the true emitter lies nothing is lit when its bounce would arrive, however near to the place it is.
+    seen = (maps.sequence > 0) & bounces(truth, 6, np.inf)
+    row, column = (np.rint(u[seen]).astype(int) for u in (truth.bounce_y, truth.bounce_x))
+    lit = maps.lit_by[row, column] & (1 << (maps.sequence[seen].astype(int) - 1))
+    assert seen.sum() > 5000
+    assert (lit > 0).mean() <= 0.01
+
+
 @pytest.mark.parametrize("face", ["left", "right"])
 def test_both_faces_are_as_flat_as_without_bounces(scan_simulated, face):
     # The number, at a third of its size; what is lost at the fold takes three times its share of a face here.
