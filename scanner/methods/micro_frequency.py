@@ -17,7 +17,6 @@ from scipy.stats import chi2 as chi2_distribution
 
 from drivers import FrameFormat
 from scanner.config import ScanSection
-from scanner.faces import Faces, find_faces
 from scanner.interreflection import (
     FEWEST,
     Detection,
@@ -48,6 +47,7 @@ from scanner.methods.regional import (
     lit_here,
     plane,
 )
+from scanner.methods.scene import faces_seen
 from scanner.methods.separated import Separated, phasors_of, separate_region
 from scanner.methods.sufficiency import Evidence, weigh
 from scanner.methods.weak_bounces import without_ripples
@@ -56,7 +56,6 @@ from scanner.phasors import RoundPhasors
 from scanner.pooling import one_path_residuals
 from scanner.regions import literal_mask
 from scanner.result import Flag, Maps
-from scanner.rig import Rig
 from scanner.strays import strays
 
 FREQUENCIES = 9
@@ -202,7 +201,7 @@ class MicroFrequencyShifting:
         if self.rounds == 1 or scan.rounds == 1 or not region.any():
             return Regional.nothing(region.shape, plan.size)
         most = scan.max_regional_sequences if scan.regional_rule == "sound" else 1
-        faces = _faces(setup.rig, maps, separated, fold) if most > 1 else None
+        faces = faces_seen(setup.rig, maps, separated, fold) if most > 1 else None
         begun = begin(separated, detection, fold, faces, maps, plan.size, scan.lit_margin_px, most)
         if evidence.one_round(scan.rounds):
             return replace(begun, queue=())
@@ -362,24 +361,6 @@ class MicroFrequencyShifting:
             failed=np.where(np.isfinite(paths[:1]), paths, state.failed),
             doubted=state.doubted | (still.region & (passed | (state.sequence == 0))),
         )
-
-
-def _faces(rig: Rig | None, first: Maps, separated: Separated, fold: Fold) -> Faces | None:
-    """Faces that round one shows; None without a rig or with one axis."""
-    one_x, one_y = first.x_p_round1, first.y_p_round1
-    if rig is None or first.x_p is None or first.y_p is None or one_x is None or one_y is None:
-        return None
-    # A third path that spoils a fit need not spoil the direct path: the face knows it.
-    two = [(_everywhere(separated, u["x"]), _everywhere(separated, u["y"])) for u in (separated.u, separated.bounce)]
-    x, y = (np.where(fold.blind, np.float32(np.nan), u) for u in (one_x, one_y))
-    return find_faces(rig, (first.x_p, first.y_p), [*two, (x, y)], np.isfinite(one_x) & np.isfinite(one_y))
-
-
-def _everywhere(separated: Separated, values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) values of all separated pixels, NaN elsewhere."""
-    found = np.full(separated.shape, np.nan, np.float32)
-    found.reshape(-1)[separated.pixels] = values
-    return found
 
 
 def _near(maps: Maps, x: NDArray[np.float32] | None, y: NDArray[np.float32] | None) -> NDArray[np.bool_]:
