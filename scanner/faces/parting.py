@@ -104,7 +104,8 @@ def find_faces(rig: Rig, sure: Coordinates, open_to: Sequence[Coordinates], want
     grid = np.ix_(rows, columns)
     across, down = np.meshgrid(columns, rows)
     rays = rig.camera.rays(np.stack([across, down], axis=-1).astype(np.float64))
-    x, y = (np.ascontiguousarray(rays[..., k]) for k in (0, 1))
+    # Where the lens model ends there is no place either, and zero harms no sum.
+    x, y = (np.nan_to_num(rays[..., k]) for k in (0, 1))
     places = [_inverse_depth(rig, c, grid) for c in (sure, *open_to)]
     offered, scale = (np.stack([p[k] for p in places]) for k in (0, 1))
     ground = x, y, offered, scale

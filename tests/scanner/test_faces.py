@@ -187,6 +187,19 @@ def test_nothing_sure_is_no_face_and_what_was_not_asked_for_is_none():
     assert (find_faces(rig, sure, [], np.ones(part.shape, bool)).label[hole] == faces.label[0, 0]).all()
 
 
+def test_beyond_the_reach_of_the_lens_model_is_no_face():
+    rig, part, _, noisy = see([WALL, TABLE], hollow=True)
+    k = rig.camera.matrix
+    # Radial distortion that folds back within the picture's corners.
+    strong = Rig(Lens(k, np.array([-1.6, 0, 0, 0]), rig.camera.size), rig.projector, rig.rotation, rig.translation)
+    reached = np.isfinite(strong.camera.pixel_rays()[..., 0])
+    assert 0.5 < reached.mean() < 0.99
+    faces = find_faces(strong, noisy, [], np.ones(part.shape, bool))
+    assert (faces.label[~reached] == 0).all()
+    assert len(np.unique(faces.label[reached])) >= 2
+    assert np.isfinite(faces.x[faces.label > 0]).all()
+
+
 def test_coordinates_off_their_epipolar_line_are_no_face():
     # A mirror shows the wall from elsewhere: smooth, and on no surface.
     rig, part, _, (x, y) = see([WALL])
