@@ -35,8 +35,8 @@ TIMED = (
 LONGEST = (
     "test_numbers", "test_calibration_numbers", "calibration/test_wizard", "scanner/test_ripples",
     "scanner/test_acquisition", "real/test_slstudio_calibration", "calibration/test_detection",
-    "scanner/test_folds", "scanner/test_matt_objects", "sim_backend/test_scenes", "scanner/test_cli", "scanner/test_regional",
-    "calibration/test_person",
+    "scanner/test_folds", "scanner/test_matt_objects", "sim_backend/test_scenes", "scanner/test_cli",
+    "scanner/test_regional", "calibration/test_person",
     "test_virtual_faults", "test_virtual_bench", "scanner/test_cli_interrupted", "drivers/test_window_faults",
 )  # fmt: skip
 """What takes longest begins first, so that no worker is left with it when the others have nothing to do any more."""
