@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from scanner.faces.seeds import ROUGH, SHARPEST_DEG
+from scanner.faces.seeds import SHARPEST_DEG
 from scanner.kernels import over_pixels
 
 _REACH = 8
@@ -142,10 +142,10 @@ def borders(
 
 @compiled
 def _plane(label, w, x, y, row, column, face, out):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
-    """Plane of a face around a cell: w there, its slopes, and the mean square of what is off it; False for too few."""
+    """Plane of a face around a cell: w there, and its slopes; False where too few cells say."""
     top, bottom = max(row - _REACH, 0), min(row + _REACH + 1, label.shape[0])
     left, right = max(column - _REACH, 0), min(column + _REACH + 1, label.shape[1])
-    n, sx, sy, sv, vv, level = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    n, sx, sy, sv, level = 0.0, 0.0, 0.0, 0.0, 0.0
     xx, xy, yy, vx, vy = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(top, bottom):
         for j in range(left, right):
@@ -154,7 +154,6 @@ def _plane(label, w, x, y, row, column, face, out):  # type: ignore[no-untyped-d
                     level = w[i, j]
                 dx, dy, v = x[i, j] - x[row, column], y[i, j] - y[row, column], w[i, j] - level
                 n += 1
-                vv += v * v
                 sx += dx
                 sy += dy
                 sv += v
@@ -177,7 +176,6 @@ def _plane(label, w, x, y, row, column, face, out):  # type: ignore[no-untyped-d
         return False
     out[1], out[2] = (cyy * cvx - cxy * cvy) / det, (cxx * cvy - cxy * cvx) / det
     out[0] = level + mv - out[1] * mx - out[2] * my
-    out[3] = vv / n - mv * mv - out[1] * cvx - out[2] * cvy
     return True
 
 
@@ -200,7 +198,7 @@ def _decide(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     other form a hollow.
     """
     height, width = label.shape
-    faces, plane = np.zeros(9, np.int32), np.zeros(4)
+    faces, plane = np.zeros(9, np.int32), np.zeros(3)
     for i in range(start, stop):
         row, column = cells[i] // width, cells[i] % width
         count, best = 0, -np.inf
@@ -226,9 +224,7 @@ def _decide(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
                     continue
                 for k in range(1 if planes else offered.shape[0]):
                     off = abs(offered[k, row, column] - plane[0]) * scale[k, row, column]
-                    # A face that bends within the window would go around a crease.
-                    bent = not planes and plane[3] * scale[k, row, column] ** 2 > (ROUGH * tolerance_px) ** 2
-                    if off <= tolerance_px and -off > best and not bent:
+                    if off <= tolerance_px and -off > best:
                         best, chosen[i] = -off, face
                         value[i] = plane[0] if planes else offered[k, row, column]
                         normal[i] = began[r, c]
@@ -238,7 +234,7 @@ def _decide(  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
 def _meet(label, w, x, y, scale, place, pair, how, start, stop):  # type: ignore[no-untyped-def]  # pragma: no cover - compiled
     """Angle and step between the planes of two faces where they meet."""
     width = label.shape[1]
-    one, two = np.zeros(4), np.zeros(4)
+    one, two = np.zeros(3), np.zeros(3)
     for i in range(start, stop):
         row, column = place[i] // width, place[i] % width
         if not _plane(label, w, x, y, row, column, pair[i, 0], one):
@@ -250,7 +246,7 @@ def _meet(label, w, x, y, scale, place, pair, how, start, stop):  # type: ignore
             # From w at the cell to the normal of the plane n · ray = w.
             plane[0] -= plane[1] * here_x + plane[2] * here_y
         dot = one[0] * two[0] + one[1] * two[1] + one[2] * two[2]
-        lengths = np.sqrt((one[:3] ** 2).sum() * (two[:3] ** 2).sum())
+        lengths = np.sqrt((one**2).sum() * (two**2).sum())
         how[i, 0] = np.degrees(np.arccos(min(max(dot / lengths, -1.0), 1.0)))
         off = (one[0] - two[0]) + (one[1] - two[1]) * here_x + (one[2] - two[2]) * here_y
         how[i, 1] = abs(off) * scale

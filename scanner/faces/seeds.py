@@ -12,7 +12,7 @@ WINDOW = 3
 SHARPEST_DEG = 25.0
 """Normals of windows side by side differ by less than this on a face; a ball of twenty pixels has more at its limb."""
 
-ROUGH = 1 / 3
+_ROUGH = 1 / 3
 """On a face coordinates lie this near (rms) to the plane of a window, in units of what continues it; more is a step."""
 
 _LEAST_SEED = 50
@@ -53,7 +53,7 @@ def seeds(
     normals, rough = _planes(w, known, rays)
     bend = _bend(normals)
     with np.errstate(invalid="ignore"):
-        sharp = known & ((bend >= SHARPEST_DEG) | (rough * scale >= ROUGH * tolerance_px))
+        sharp = known & ((bend >= SHARPEST_DEG) | (rough * scale >= _ROUGH * tolerance_px))
         # Beside what is not known nobody sees whether there is a crease: no seed reaches there.
         smooth = known & ~sharp & np.isfinite(bend)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(smooth.astype(np.uint8), connectivity=4)

@@ -125,7 +125,7 @@ WALL = Plane((0.0, 0.0, 1.0), 640.0)
 def test_faces_part_at_creases_and_edges_to_the_pixel(bodies, hollow):
     rig, part, _, noisy = see(bodies, hollow=hollow)
     faces = find_faces(rig, noisy, [], np.ones(part.shape, bool))
-    assert agree(faces.label, part, away_from_borders(part, 2))
+    assert agree(faces.label, part, away_from_borders(part, 1))
 
 
 def test_a_ball_and_a_gentle_bend_are_one_face_each():
@@ -160,18 +160,64 @@ def test_over_what_is_open_faces_go_on_with_the_path_on_them(scale):
     assert np.nanmedian(off[~open_to]) < max(2 * SIGMA_PX, scale * pitch / 2)
 
 
-def test_a_shortcut_around_a_crease_is_not_taken():
-    # The crease is rounded by what bounces do to the coordinate: each step is small, and the face would turn.
-    rig, part, (x, y), noisy = see(groove(100.0), hollow=True)
-    blurred = []
-    for c in (x, y):
-        padded = np.pad(c, ((0, 0), (6, 6)), mode="edge")
-        blurred.append(np.mean([padded[:, k : k + c.shape[1]] for k in range(13)], axis=0).astype(np.float32))
+def rounded(noisy, over):
+    """Coordinates averaged over so many columns: what bounces from close by do to them at a crease."""
+    found = []
+    for c in noisy:
+        padded = np.pad(c, ((0, 0), (over // 2, over // 2)), mode="edge")
+        found.append(np.mean([padded[:, k : k + c.shape[1]] for k in range(over)], axis=0).astype(np.float32))
+    return tuple(found)
+
+
+@pytest.mark.parametrize("over", [9, 17, 25])
+@pytest.mark.parametrize("certain", [True, False], ids=["sure", "open"])
+def test_faces_do_not_go_around_a_rounded_crease(over, certain):
+    # Each step from cell to cell is small, and the face would turn from one plane into the other.
+    rig, part, _, noisy = see(groove(96.0), hollow=True)
     crease = np.abs(np.diff(part, axis=1, prepend=part[:, :1])).argmax(axis=1)
-    near = np.abs(np.arange(part.shape[1]) - crease[:, None]) < 7
-    sure = tuple(np.where(near, np.float32(np.nan), c) for c in noisy)
-    faces = find_faces(rig, sure, [tuple(blurred)], np.ones(part.shape, bool))
-    assert agree(faces.label, part, away_from_borders(part, 7))
+    away = np.arange(part.shape[1]) - crease[:, None]
+    round_one = rounded(noisy, over)
+    near = np.abs(away) < over // 2 + 1
+    # A gap on one side, as where a region is refused: no crease can be seen beside it.
+    gap = (away > 4) & (away < 12) & (np.arange(part.shape[0]) % 60 < 40)[:, None]
+    hidden = gap if certain else gap | near
+    sure = tuple(np.where(hidden, np.float32(np.nan), c) for c in round_one)
+    open_to = tuple(np.where(gap, np.float32(np.nan), c) for c in round_one)
+    faces = find_faces(rig, sure, [open_to], np.ones(part.shape, bool))
+    assert agree(faces.label, part, away_from_borders(part, 3) & (np.abs(away) > over // 2 + 4))
+
+
+@pytest.mark.parametrize("right_too", [False, True])
+def test_among_few_coordinates_faces_end_at_the_crease(right_too):
+    # So few are known around the crease that nothing there tells normals; only what a face was like before does.
+    rig, part, _, noisy = see(groove(96.0), hollow=True)
+    crease = np.abs(np.diff(part, axis=1, prepend=part[:, :1])).argmax(axis=1)
+    away = np.arange(part.shape[1]) - crease[:, None]
+    few = (away < 40) & (away > (-40 if right_too else -8))
+    missing = few & (np.random.default_rng(2).random(part.shape) < 0.65)
+    sure = tuple(np.where(missing, np.float32(np.nan), c) for c in noisy)
+    faces = find_faces(rig, sure, [], np.ones(part.shape, bool))
+    assert (faces.label > 0).mean() > 0.99
+    assert agree(faces.label, part, away_from_borders(part, 6) & (faces.label > 0))
+
+
+def test_of_a_hole_that_hides_a_crease_each_face_gets_its_part():
+    rig, part, _, noisy = see(groove(112.0), hollow=True)
+    crease = np.abs(np.diff(part, axis=1, prepend=part[:, :1])).argmax(axis=1)
+    away = np.arange(part.shape[1]) - crease[:, None]
+    # It reaches 30 px to one side of the crease and 4 px to the other.
+    sure = tuple(np.where((away > -30) & (away < 4), np.float32(np.nan), c) for c in noisy)
+    faces = find_faces(rig, sure, [], np.ones(part.shape, bool))
+    assert agree(faces.label, part, away_from_borders(part, 3))
+
+
+def test_pieces_of_a_face_are_one():
+    rig, part, _, noisy = see([WALL])
+    parted = np.zeros(part.shape, bool)
+    parted[:, 90:102] = parted[70:82] = True
+    sure = tuple(np.where(parted, np.float32(np.nan), c) for c in noisy)
+    faces = find_faces(rig, sure, [], np.ones(part.shape, bool))
+    assert faces.label.min() == faces.label.max() == 1
 
 
 def test_nothing_sure_is_no_face_and_what_was_not_asked_for_is_none():

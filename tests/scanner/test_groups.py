@@ -172,12 +172,12 @@ def test_faces_that_suffer_least_share_a_sequence(most):
 
 
 def test_at_a_crease_the_other_face_throws_the_bounce():
-    # Both faces of a fold have pixels in the cells along it; the bounces there come from the other one.
+    # A cell along the fold holds pixels of both faces, more of the left one, which is lit from just beyond the fold.
     x, y = square(100, 50, side=200)
-    left = x < 200
-    near = np.abs(x - 200) < 30
-    bounce_x, bounce_y = np.where(near, 400 - x, np.nan), np.where(near, y + 3, np.nan)
+    left = x < 205.5
+    near = left & (x > 199)
+    bounce_x, bounce_y = np.where(near, 411 - x, np.nan), np.where(near, y + 7, np.nan)
     face = np.where(left, 1, 2).astype(np.int32)
     group = group_places(x, y, bounce_x.astype(np.float32), bounce_y.astype(np.float32), 8, face)
     assert group.max() == 1
-    assert len(np.unique(group[left])) == len(np.unique(group[~left])) == 1
+    assert [set(group[side].tolist()) - {-1} for side in (left, ~left)] in ([{0}, {1}], [{1}, {0}])
