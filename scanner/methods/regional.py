@@ -170,12 +170,13 @@ def begin(
     rim = rim & first.valid & ~fold.blind
     if faces is not None:
         rim = rim | (_beside(detection, one_x, one_y) & first.valid & ~fold.blind & (faces.label > 0))
-        paths = faces.settled(paths)
+        paths = np.where(detection.region | rim, faces.settled(paths), np.float32(np.nan))
         one_x, one_y = (np.where(faces.label > 0, f, u) for f, u in ((faces.x, one_x), (faces.y, one_y)))
     group = np.where(known, np.int8(0), np.int8(-1))
     if both and most > 1:
         group = _groups(paths, located, detection.region, rim, faces, most)
-    if group.max() < 1 and both:
+    # Faces in one group do not light each other; of anything else in one group nobody knows.
+    if both and group.max() < (1 if faces is None else 0):
         group = np.where(plausible(separated) & lit_together(*paths), np.int8(0), np.int8(-1))
     if faces is not None:
         # Of a face without a group nothing is lit.

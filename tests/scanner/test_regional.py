@@ -17,6 +17,7 @@ from drivers import DeviceLostError
 from scanner.acquisition import Acquisition
 from scanner.config import GatesSection, ScanSection
 from scanner.decoding import Decoder
+from scanner.faces import Faces
 from scanner.methods import METHODS
 from scanner.methods.base import Setup
 from scanner.methods.fold import Fold
@@ -290,3 +291,31 @@ def test_a_surface_that_lights_the_chosen_one_stays_dark_whether_its_separations
     assert len(begun.queue) == 1
     assert begun.queue[0][60:160, 110:210].all()
     assert not begun.queue[0][:, 480:].any()
+
+
+def test_around_a_region_on_a_single_face_is_measured_along():
+    # One face, lit from outside the picture: nothing takes turns, and what is undetected beside it is still served.
+    rows, columns = np.mgrid[:200, :200].astype(np.float32)
+    x, y = 100 + columns, 50 + rows
+    region = (np.abs(rows - 100) < 30) & (np.abs(columns - 100) < 30)
+    whole = separation(x, y, x + 350, np.ones(x.shape, bool))
+    pixels = np.flatnonzero(region)
+    per_pixel = {
+        name: {a: v[pixels] for a, v in values.items()} if isinstance(values, dict) else values[pixels]
+        for name, values in vars(whole).items()
+        if name != "shape"
+    }
+    separated = replace(whole, **per_pixel)
+    no = np.zeros(x.shape, bool)
+    detection = SimpleNamespace(region=region, penumbra=no, depth_edge=no)
+    first = SimpleNamespace(x_p_round1=x, y_p_round1=y, valid=~no)
+    faces = Faces(np.ones(x.shape, np.int32), x, y)
+    begun = begin(separated, detection, Fold.none(no.shape, (700, 300)), faces, first, (700, 300), 8.0, 4)
+    assert len(begun.queue) == 1
+    beside = ~region & (np.abs(rows - 100) < 55) & (np.abs(columns - 100) < 30)
+    assert begun.served[beside].all()
+    assert (begun.own[beside | region] == 1).all()
+    assert begun.queue[0][100:200, 175:225].all()
+    # Two fringes and the margin away it is dark.
+    assert not begun.queue[0][:, 280:].any()
+    assert not begun.served[:20].any()
